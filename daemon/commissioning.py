@@ -125,16 +125,22 @@ class Report(Record):
 
 @dataclass(frozen=True, slots=True)
 class MotionCap:
-    """The largest speeds and torque that a rig's report allows, and the reason for these limits."""
+    """The largest speeds and torque that a rig's report allows, why no larger ones, and what raises them."""
 
     why: str
+    cure: str = ""
     wrist_speed_rad_per_s: float = CAPPED_RAD_PER_S
     linear_speed_m_per_s: float = CAPPED_M_PER_S
     torque_nm: float = CAPPED_NM
 
     @property
     def sentence(self) -> str:
-        """Return the cap in words."""
+        """Return the cap in words, with its cure."""
+        return "; ".join(filter(None, (self.cause, self.cure)))
+
+    @property
+    def cause(self) -> str:
+        """Return the cap in words, without its cure."""
         return (
             f"the robot is capped at {self.wrist_speed_rad_per_s:g} rad/s, {self.linear_speed_m_per_s:g} m/s and "
             f"{self.torque_nm:g} N·m: {self.why}"
@@ -169,7 +175,7 @@ class Commissioning:
             return None
         if self._report is None or not self.counts:
             cure = CURE.format(option=" --emulate" if self._rehearsed else "")
-            return MotionCap(f"{self._reason or self._other}; {cure}")
+            return MotionCap(self._reason or self._other, cure)
         found = self._report.supplied()
         wrist_rad_per_s = found.wrist_speed_rad_per_s if self._report.has(_SPEED_NEEDS) else None
         torque_nm = found.torque_nm if self._report.has(_TORQUE_NEEDS) else None

@@ -14,6 +14,7 @@ from shearloop.drivers.ur.ports import closed_ports_sentence, connected, probe_p
 from shearloop.drivers.ur.rtde import CONTROLLER_VERSION, agree_on_protocol, free_registers, request
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import GENERATIONS, UrSettings
+from shearloop.errors import Hint
 
 # By major version: the oldest controllers with all that ur-rtde uses, and the newest that ur-rtde 1.6 is tested on.
 OLDEST: Final = {3: (3, 10), 5: (5, 4)}
@@ -72,14 +73,15 @@ def check_generation(settings: UrSettings, version: str) -> None:
         )
 
 
-def untested_sentence(version: str) -> str:
-    """Return a warning about a version (5.17.3.0) that is newer than those tested, or an empty string."""
+def untested(version: str) -> Hint | None:
+    """Return a hint about a version (5.17.3.0) that is newer than those tested, or None."""
     numbers = tuple(map(int, version.split(".")))[:3]
     newest = NEWEST_TESTED[numbers[0]]
     if numbers <= newest:
-        return ""
+        return None
     tested = ".".join(map(str, newest))
-    return f"PolyScope {version} is newer than {tested}, the newest that ur-rtde 1.6 is tested on: move slowly first."
+    newer = f"PolyScope {version} is newer than {tested}, the newest that ur-rtde 1.6 is tested on"
+    return Hint(newer, "move slowly first")
 
 
 def query_controller(host: str, timeout_s: float) -> ControllerInfo:

@@ -13,6 +13,7 @@ from shearloop.drivers.defaults import PRIMARY_PORT
 from shearloop.drivers.errors import ProtocolError, system_reason
 from shearloop.drivers.ur.messages import ControllerError
 from shearloop.drivers.ur.ports import SERVICES_MENU, lose_dead_peers
+from shearloop.errors import Hint
 
 # Its size and kind; then, of a message: the controller's time, the source and the kind of message.
 _PACKAGE: Final = struct.Struct(">iB")
@@ -61,20 +62,20 @@ def _error_in(package: bytes) -> ControllerError | None:
 
 
 class PrimaryPort:
-    """A connection that only reads; `warning` says why it is missing, and is empty while it is open."""
+    """A connection that only reads; `missing` says why there is none, and is None while it is open."""
 
     def __init__(self, host: str, timeout_s: float) -> None:
         """Connect; a controller that does not serve the port is no error."""
         self._parser = ErrorCodeParser()
         self._connection: socket.socket | None = None
-        self.warning = ""
+        self.missing: Hint | None = None
         try:
             self._connection = socket.create_connection((host, PRIMARY_PORT), timeout_s)
         except OSError as error:
-            self.warning = (
+            self.missing = Hint(
                 f"The controller does not serve port {PRIMARY_PORT} (Primary Client Interface: "
-                f"{system_reason(error)}), so that its error codes are not in the log; on an e-Series enable it under "
-                f"{SERVICES_MENU}."
+                f"{system_reason(error)}), so that its error codes are not in the log",
+                f"on an e-Series enable it under {SERVICES_MENU}",
             )
         else:
             lose_dead_peers(self._connection)

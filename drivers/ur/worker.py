@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, untested_sentence
+from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE, SERIAL_NUMBER, ask_dashboard, serial_number_in
 from shearloop.drivers.ur.fitness import why_unfit
 from shearloop.drivers.ur.messages import RobotLostError
@@ -156,7 +156,8 @@ def connect(pipe: Pipe, settings: UrSettings, receiver: type[RtdeReceiver] = Rtd
         registers = free_registers(host, settings.connect_timeout_s / 8, version)
         if registers is None:
             raise registers_in_use(host)
-        warning = " ".join(filter(None, (untested_sentence(version), primary.warning)))
+        hints = (untested(version), primary.missing)
+        warning = " ".join(hint.sentence for hint in hints if hint is not None)
         pipe.send(messages.WorkerPhase("connecting", warning, controller))
         return UrArm(settings, registers, primary, receiver)
     except RuntimeError as error:

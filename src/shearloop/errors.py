@@ -2,10 +2,23 @@
 
 import sys
 from importlib.util import find_spec
+from typing import NamedTuple
 
 
 class UserError(Exception):
     """Something in a configuration, a file or a command line that its author can mend; the message says how."""
+
+
+class Hint(NamedTuple):
+    """Something that works less well than it could, and what helps; both without a full stop."""
+
+    cause: str
+    cure: str
+
+    @property
+    def sentence(self) -> str:
+        """Both as one sentence."""
+        return f"{self.cause}: {self.cure}."
 
 
 class ActionError(Exception):

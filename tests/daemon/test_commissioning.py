@@ -342,7 +342,7 @@ def test_what_one_stage_judged_makes_that_stage_old_and_no_other(tmp_path, chang
     before = identity_of(config, VERSION, SERIAL)
     change(tmp_path)
     config = load_daemon_config(path)
-    why = commissioning_of(config, read_settings(config.robot), NOW).cap.why
+    why = commissioning_of(config, read_settings(config.robot), NOW).cap.sentence
     assert f"`{key}` changed since stage {stage} s" in why
     assert f"`--stages {stage}`" in why
     assert identity_of(config, VERSION, SERIAL) == before, "the other stages count"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
-from shearloop.drivers.ur.control_box import ControllerInfo, untested_sentence
+from shearloop.drivers.ur.control_box import ControllerInfo, untested
 from shearloop.drivers.ur.limits import PAYLOAD_KG, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import InstalledTool, UrSettings
@@ -40,8 +40,8 @@ class Identity:
 def measure(context: Context) -> Measured:
     """Return the stage's lines; raises RobotLostError if the controller does not answer."""
     outputs = context.rig.outputs(context.registers)
-    if untested := untested_sentence(context.controller.version):
-        context.operator.accept(untested)
+    if (newer := untested(context.controller.version)) is not None:
+        context.operator.accept(newer.sentence)
     checksum = context.operator.ask(CHECKSUM_QUESTION, Played(f"the pendant shows {EMULATED_CHECKSUM}"))
     typed_kg = None
     if math.isnan(outputs.payload_kg) and context.settings.tool.payload_kg is None:
@@ -97,8 +97,8 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
 
 def _polyscope(version: str) -> Line:
     """Return the line on the version; a newer one than the tested ones is noted, after the operator went on with it."""
-    if untested := untested_sentence(version):
-        return Line(what="PolyScope", value=f"{untested} The operator went on with it.")
+    if (newer := untested(version)) is not None:
+        return Line(what="PolyScope", value=f"{newer.sentence} The operator went on with it.")
     return judged("PolyScope", version, "a version that ur-rtde is tested on", "known versions", passed=True)
 
 

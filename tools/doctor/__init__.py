@@ -29,7 +29,7 @@ from shearloop.tools.doctor.devices import (
     differing_keys,
     listen_for_frames,
 )
-from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, split_cure, trouble
+from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
 from shearloop.tools.doctor.robot_values import check_robot_values
 from shearloop.tools.running_daemon import whose_daemon
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
@@ -241,8 +241,8 @@ def check_cap(config: DaemonConfig) -> Iterator[Finding]:
     if commissioning.counts:
         yield good("commissioning", commissioning.sentence)
     else:
-        what, cure = split_cure(commissioning.sentence)
-        yield note("commissioning", what, "an experiment that asks for more is refused", cure)
+        cap = commissioning.cap
+        yield note("commissioning", cap.cause, "an experiment that asks for more is refused", cap.cure)
 
 
 def check_bank(name: str, fingertip: FingertipConfig, geometry: GivenGeometry | None = None) -> Finding:

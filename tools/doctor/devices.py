@@ -23,7 +23,7 @@ from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.shear_skin.instruments import PolledInstrument
-from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested_sentence
+from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.primary_port import PrimaryPort
@@ -123,13 +123,12 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
         yield from_error("robot", reason, "the daemon does not drive it")
         return
     with contextlib.closing(PrimaryPort(host, ROBOT_TIMEOUT_S)) as primary:
-        what, _, cure = primary.warning.rpartition("; ")
-    if what:
-        yield note("robot's error codes", what, "the log does not have the controller's codes", cure.rstrip("."))
+        missing = primary.missing
+    if missing is not None:
+        yield note("robot's error codes", missing.cause, "the log does not have the controller's codes", missing.cure)
     answers = f"{host} answers, PolyScope {seen.version}"
-    if untested := untested_sentence(seen.version):
-        what, _, cure = untested.rpartition(": ")
-        yield note("robot", answers, what, cure.rstrip("."))
+    if (newer := untested(seen.version)) is not None:
+        yield note("robot", answers, newer.cause, newer.cure)
     else:
         yield good("robot", answers)
     yield from check_identity(config, settings, seen.version, seen.serial_number)
@@ -167,9 +166,8 @@ def check_identity(config: DaemonConfig, settings: UrSettings, version: str, ser
     if not commissioning.counts:
         return
     commissioning.on_controller(version, serial_number)
-    if not commissioning.counts:
-        what, cure = split_cure(commissioning.sentence)
-        yield note("commissioned robot", what, "an experiment that asks for more is refused", cure)
+    if not commissioning.counts and (cap := commissioning.cap) is not None:
+        yield note("commissioned robot", cap.cause, "an experiment that asks for more is refused", cap.cure)
 
 
 def ask_status(address: str) -> Mapping[str, Any] | None:

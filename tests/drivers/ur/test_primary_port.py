@@ -70,7 +70,7 @@ async def test_a_protective_stop_has_its_code():
 
     async with controller.open(), asyncio.timeout(60), running(play()):
         port = await asyncio.to_thread(PrimaryPort, HOST, 5.0)
-        assert port.warning == ""
+        assert port.missing is None
         # The controller takes the connection at some time.
         found: list[ControllerError] = []
         while not found:
@@ -88,6 +88,6 @@ async def test_a_protective_stop_has_its_code():
 async def test_a_closed_port_is_named_with_its_menu():
     async with Controller(Robot(), host=HOST, closed_ports=(PRIMARY_PORT,)).open():
         port = await asyncio.to_thread(PrimaryPort, HOST, 5.0)
-    assert f"does not serve port {PRIMARY_PORT} (Primary Client Interface" in port.warning
-    assert "Settings → Security → Services" in port.warning
+    assert f"does not serve port {PRIMARY_PORT} (Primary Client Interface" in port.missing.cause
+    assert "Settings → Security → Services" in port.missing.cure
     assert port.read() == []

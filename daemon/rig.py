@@ -29,6 +29,7 @@ from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
 from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
 from shearloop.daemon.supervisor import Supervisor, Task
 from shearloop.daemon.torques import WRENCH, TorqueSource
+from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
@@ -351,7 +352,10 @@ def build_rig(
     link = LinkMonitor(LinkReporter("robot", loop))
     settings_for, holds = commissioning.on_controller, loop.tool.may_be_loaded
     robot = UrRobot(settings, link, settings_for=settings_for, holds=holds)
-    memory = RigMemory(files, loop, sensors.load_cell, robot) if keeps_memory(config) else NoMemory()
+    memory: RigMemory | NoMemory = NoMemory()
+    if keeps_memory(config):
+        memory = RigMemory(files, loop, sensors.load_cell, WrenchZero(loop, robot))
+        memory.restore()
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, memory.save_present)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning, LoadedFiles.of(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}

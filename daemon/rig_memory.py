@@ -17,11 +17,10 @@ from pydantic import ConfigDict
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
-from shearloop.daemon.control.operator_view import CLAMPED_CURE
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
+from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import Six
 from shearloop.files import read_file, replace_file
 from shearloop.models import validated
@@ -29,8 +28,6 @@ from shearloop.models import validated
 VERSION = 1
 # The file is written at this interval, and at the start of each experiment.
 FOLLOWS_S = 0.1
-# A known zero of the wrench needs a step: the command tares sensors alone.
-RELEASE_AND_TARE = "run an experiment that begins with the steps `release` and `tare`"
 # Nothing shows that another tool was clamped.
 CLAMPED_ANOTHER = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
 # A state takes some hundred bytes.
@@ -148,7 +145,7 @@ class RigMemory:
     files: RobotFiles
     loop: ControlLoop
     load_cell: LoadCell | None
-    robot: UrRobot
+    wrench: WrenchZero
     error: str = ""
     # The experiment that is about to begin.
     _starting: str = ""
@@ -157,22 +154,14 @@ class RigMemory:
     # The load cell's zero in its calibration, and the restored zero.
     _calibrated_zero: float | None = None
     _load_restored: float | None = None
-    # Whether the wrench has the zero of the earlier grip, and whether a tare took that zero.
-    _wrench_restored: bool = False
-    _wrench_tared: bool = False
     # Whether the gripper has shown if it still has the earlier grip. Until then the restored zeros are kept.
     _judged: bool = False
-    # Whether a program is starting: the controller may have zeroed its wrench under load.
-    _wrench_changes: bool = False
-    # Whether the wrench had a known zero when the state was last written.
-    _wrench_had_zero: bool = False
     _writing: asyncio.Lock = field(default_factory=asyncio.Lock)
 
-    def __post_init__(self) -> None:
-        """Restore the state that the last daemon of this robot has left."""
-        remembered = read_memories(self.files)
+    def restore(self) -> None:
+        """Give the state that the last daemon of this robot has left to loop, load cell and robot, before they run."""
+        remembered = self._written = read_memories(self.files)
         remembered.restore(self.loop, self._on_judged)
-        self._written = remembered
         clamped = not self.loop.tool.has_gripper
         if clamped and remembered.force_n is not None:
             # They are of a grip, and the configuration does not name that gripper any more.
@@ -183,37 +172,27 @@ class RigMemory:
             self._calibrated_zero, self._load_restored = cell.calibration.tare_counts, zero
             cell.tare(zero)
         if remembered.wrench_zero is not None:
-            self._wrench_restored, self._wrench_tared = True, remembered.wrench_tared
-            self.robot.restore_wrench_zero(remembered.wrench_zero)
+            self.wrench.restore(remembered.wrench_zero, tared=remembered.wrench_tared)
         if clamped:
             # Nothing shows whether it is another tool: the operator says so with `release`.
             self._on_judged("")
 
     def _on_judged(self, why_another: str) -> None:
         """Keep the zeros of the earlier grip, or remove them if the gripper does not have that grip any more."""
-        zeros = [
-            name
-            for name, restored in ((LOAD_CELL, self._calibrated_zero is not None), (WRENCH, self._wrench_restored))
-            if restored
-        ]
         log = structlog.get_logger()
         self._judged = True
+        zeros = [LOAD_CELL] if self._calibrated_zero is not None else []
         if not why_another:
-            known = [name for name in zeros if name != WRENCH or self._wrench_tared]
-            for name in known:
+            if self.wrench.keep():
+                zeros.append(WRENCH)
+            for name in zeros:
                 self.loop.on_restored_zero(name)
-            clamped = not self.loop.tool.has_gripper
-            if known:
-                another = {"cure": CLAMPED_ANOTHER} if clamped else {}
-                log.info("the zeros of the present tool are kept", of=known, **another)
-            if self._wrench_restored and not self._wrench_tared:
-                log.info(
-                    "the wrench has no known zero with the present tool, and its torques may be off by any load",
-                    reason="none was taken before the grip, the connection to the robot or its process was lost, or "
-                    "the last daemon ended while the robot's program started",
-                    cure=self._wrench_cure,
-                )
+            if zeros:
+                another = {} if self.loop.tool.has_gripper else {"cure": CLAMPED_ANOTHER}
+                log.info("the zeros of the present tool are kept", of=zeros, **another)
             return
+        if self.wrench.forget():
+            zeros.append(WRENCH)
         log.warning(
             "the gripper does not have the grip of the last daemon, whose angle, force and zeros are not used",
             reason=why_another,
@@ -228,8 +207,6 @@ class RigMemory:
             and cell.calibration.tare_counts == self._load_restored
         ):
             cell.tare(self._calibrated_zero)
-        if self._wrench_restored:
-            self.robot.forget_wrench_zero()
 
     async def run(self) -> None:
         """Write every change until cancelled."""
@@ -248,15 +225,14 @@ class RigMemory:
 
     async def save_present(self) -> str | None:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
-        self._watch_wrench()
-        self._note_lost_zero()
+        self.wrench.watch()
         state = Remembered.of(self.loop)
         state = replace(state, running=state.running or self._starting)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)
         if self.loop.tool.may_be_loaded():
-            state = replace(state, wrench_zero=self.robot.wrench_zero, wrench_tared=self._knows_wrench_zero)
+            state = replace(state, wrench_zero=self.wrench.zero, wrench_tared=self.wrench.tared)
         await self.save(state)
         return self.error or None
 
@@ -266,40 +242,6 @@ class RigMemory:
         cell = self.load_cell
         restored = cell is not None and cell.calibration.tare_counts == self._load_restored
         return self.loop.has_zero(LOAD_CELL) or (restored and not self._judged)
-
-    @property
-    def _knows_wrench_zero(self) -> bool:
-        """Whether a tare took the wrench's zero, in the running program."""
-        if self._wrench_changes:
-            return False
-        return self.loop.has_zero(WRENCH) or (self._wrench_tared and not self._judged)
-
-    def _note_lost_zero(self) -> None:
-        """Log that the wrench has lost its zero under a tool, which a later experiment, or daemon, finds missing."""
-        has_zero = self.loop.has_zero(WRENCH)
-        if self._wrench_had_zero and not has_zero and self.loop.tool.may_be_loaded():
-            structlog.get_logger().warning(
-                "the zero of the wrench is lost with the connection to the robot, or with the process that drives it: "
-                "its torques on the present tool may be off by any load",
-                cure=self._wrench_cure,
-            )
-        self._wrench_had_zero = has_zero
-
-    @property
-    def _wrench_cure(self) -> str:
-        return RELEASE_AND_TARE if self.loop.tool.has_gripper else CLAMPED_CURE
-
-    def _watch_wrench(self) -> None:
-        """Note whether a program is starting: if the daemon is killed now, the earlier zero must not be used."""
-        robot_state = self.robot.state
-        if robot_state is None:
-            return
-        # A start that is given up leaves motion blocked; its program may run on, with a zero of its own.
-        ready = robot_state.program_running and (robot_state.awaits_enable or not robot_state.blocked)
-        if robot_state.recovering:
-            self._wrench_changes = True
-        elif ready:
-            self._wrench_changes = False
 
     async def save(self, state: Remembered) -> None:
         """Write a state, unless the file has it already; a failure is logged once, and the write is tried again.

@@ -15,6 +15,7 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.rig_memory import RigMemory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.torques import TorqueSample, TorqueSource
+from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.emulators.scene import Twin, TwinSettings
@@ -142,5 +143,7 @@ def phase(rig: Rig) -> ExperimentPhase:
 def memory_of(
     loop: ControlLoop, cell: LoadCell | None = None, robot: UrRobot | None = None, files: RobotFiles = FILES
 ) -> RigMemory:
-    """Return the memory of a rig, whose robot is not connected unless a test has its own."""
-    return RigMemory(files, loop, cell, UrRobot(SETTINGS) if robot is None else robot)
+    """Return the restored memory of a rig, whose robot is not connected unless a test has its own."""
+    memory = RigMemory(files, loop, cell, WrenchZero(loop, UrRobot(SETTINGS) if robot is None else robot))
+    memory.restore()
+    return memory

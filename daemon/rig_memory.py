@@ -70,23 +70,6 @@ class Remembered:
         return self.grip != NO_GRIP or self.load_zero is not None or self.wrench_zero is not None
 
     @property
-    def held(self) -> str:
-        """A sentence on a tool that may be held, without a capital letter and a full stop; empty without a grip."""
-        if not self.grips:
-            return ""
-        known = [
-            text.format(value)
-            for text, value in (
-                ("gripped with at most {:g} N", self.force_n),
-                ("{:.1f} mm wide", self.width_mm),
-                ("with a stated diameter of {:g} mm", self.stated_tool_mm),
-                ("its angle counts from {:.3f} rad of wrist 3", self.origin_rad),
-            )
-            if value is not None
-        ]
-        return ", ".join(["a tool may be held", *known])
-
-    @property
     def faults(self) -> tuple[Fault, ...]:
         """The faults of the stop that waits for the operator, one for each code; a killed experiment is one of them."""
         entries = list(self.stop)

@@ -24,11 +24,6 @@ class RobotFiles:
         return memory_path(self.host)
 
     @property
-    def lock(self) -> Path:
-        """The file of its lock."""
-        return _file(one_spelling(self.host), ".lock")
-
-    @property
     def states_by_name(self) -> tuple[Path, ...]:
         """Files of states under a name, which no program writes: a name can have been any robot's."""
         states = state_folder().glob("robot-*.json")
@@ -72,7 +67,7 @@ def lock_robot(files: RobotFiles, commands: str = "", gripper: tuple[str, int] |
     The lock ends with the process in any case. If the file cannot be made, no experiment starts, and nothing is locked.
     """
     with contextlib.ExitStack() as opened:
-        _lock(files.lock, f"robot at {files.host}", commands, opened)
+        _lock(_file(one_spelling(files.host), ".lock"), f"robot at {files.host}", commands, opened)
         if gripper is not None:
             opened.enter_context(lock_gripper(*gripper, commands))
         yield

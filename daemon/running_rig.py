@@ -15,10 +15,7 @@ EMULATED_HEADING: Final = f"{EMULATED}: every device of this rig is emulated."
 
 @dataclass(frozen=True, slots=True)
 class RunningRig:
-    """The rig of a daemon: its name, whether it is emulated, its address of messages, and its devices.
-
-    `instance` is the daemon's own.
-    """
+    """A daemon's rig: its name, whether it is emulated, its address of messages, its devices; and the daemon itself."""
 
     rig: str = ""
     emulated: bool = False

@@ -3,10 +3,6 @@
 import contextlib
 import ipaddress
 import socket
-import threading
-
-# A name server that is out of reach must not delay the message for longer.
-RESOLVED_WITHIN_S = 2.0
 
 
 def why_no_host(host: str) -> str:
@@ -82,23 +78,10 @@ def why_no_address(host: str) -> str:
         return f"{reason}; give the device's address"
     if is_address(one_spelling(host)):
         return ""
+    # Only the mistake needs it.
+    from shearloop.drivers.name_look_up import look_up
+
     name = "is a name, which can mean another device tomorrow"
-    if present := _present_addresses(host):
+    if present := dict.fromkeys(map(one_spelling, look_up(host))):
         return f"{name}: write {' or '.join(present)}, which {host!r} means now"
     return f"{name}, and it cannot be looked up now: write the device's address"
-
-
-def _present_addresses(name: str) -> list[str]:
-    """Return the addresses of a name in their `one_spelling`; none if it is not found in time."""
-    found: list[str] = []
-
-    def look_up() -> None:
-        with contextlib.suppress(OSError, UnicodeError):
-            answers = socket.getaddrinfo(name, None, type=socket.SOCK_STREAM)
-            found.extend(one_spelling(str(answer[4][0])) for answer in answers)
-
-    # A look-up cannot be broken off, and must not keep the process from ending either.
-    asking = threading.Thread(target=look_up, name="look-up", daemon=True)
-    asking.start()
-    asking.join(RESOLVED_WITHIN_S)
-    return list(dict.fromkeys(found))

@@ -94,11 +94,12 @@ async def _grip(
     gripper: "RobotiqGripper", diameters_mm: list[float], operator: Operator, left: "Remembered"
 ) -> list[tuple[float, float]]:
     from shearloop.tools.halted_fingers import halted_if_interrupted
+    from shearloop.tools.left_tool import left_tool
 
     with operator:
         try:
             await gripper.connect()
-            for sentence in (*(fault.cause for fault in left.faults), left.held):
+            for sentence in (*(fault.cause for fault in left.faults), left_tool(left)):
                 if sentence:
                     await operator.ask(f"From the last program: {sentence}. Look at the rig, then press Enter.")
             warning = "The fingers will open and close. Empty them, keep your hands clear, then press Enter."

@@ -303,12 +303,12 @@ def _words(step: Step, turn: Turn, gripper: GripperModel | None, speeds: Speeds)
         case steps.ApproachStep(pose_m_rad=pose) if pose is not None:
             x, y, z = pose[:3]
             return (
-                f"moves the arm in a straight line to x {x:g}, y {y:g}, z {z:g} m {speeds.moving(step.speed_m_per_s)}"
+                f"moves the arm in a straight line to x {x:g}, y {y:g}, z {z:g} m {_moving(step.speed_m_per_s, speeds)}"
             )
         case steps.ApproachStep(along_tool_m=distance_m):
             way = "away from the robot" if (distance_m or 0.0) >= 0 else "towards the robot"
             along_mm = 1e3 * abs(distance_m or 0.0)
-            return f"moves the arm {along_mm:g} mm along the tool, {way}, {speeds.moving(step.speed_m_per_s)}"
+            return f"moves the arm {along_mm:g} mm along the tool, {way}, {_moving(step.speed_m_per_s, speeds)}"
         case steps.GripStep():
             empty = "stops the experiment if it meets nothing" if step.expect_object else "may meet nothing"
             to = f"closes the fingers to {step.width_mm:g} mm, or onto a tool, at {step.speed_mm_per_s:g} mm/s"
@@ -322,7 +322,7 @@ def _words(step: Step, turn: Turn, gripper: GripperModel | None, speeds: Speeds)
         case steps.AdaptStep():
             return f"corrects the gain of {step.fingertip} by the {step.reference.replace('_', ' ')}; nothing turns"
         case steps.TurnToStep():
-            return f"turns wrist 3 to {_angle(step.angle_rad)} {speeds.turning(step.speed_rad_per_s)}"
+            return f"turns wrist 3 to {_angle(step.angle_rad)} {_turning(step.speed_rad_per_s, speeds)}"
         case steps.TwistStep():
             return _twist(step, turn, speeds)
         case steps.HoldTorqueStep():
@@ -332,9 +332,19 @@ def _words(step: Step, turn: Turn, gripper: GripperModel | None, speeds: Speeds)
             return f"turns the wrist {until}, and holds it for {step.hold_s:g} s"
         case steps.TightenStep():
             until = f"until {step.until_torque_nm:g} N·m or {_angle(step.until_angle_rad)}"
-            return f"turns the wrist {step.direction} {speeds.turning(step.speed_rad_per_s)} {until}"
+            return f"turns the wrist {step.direction} {_turning(step.speed_rad_per_s, speeds)} {until}"
         case steps.WaitStep():
             return f"stands still for {step.wait_s:g} s"
+
+
+def _turning(asked_rad_per_s: float, speeds: Speeds) -> str:
+    """Return in words how fast a step turns the wrist."""
+    return f"at {min(asked_rad_per_s, speeds.wrist_rad_per_s):g} rad/s"
+
+
+def _moving(asked_m_per_s: float, speeds: Speeds) -> str:
+    """Return in words how fast a step moves the tool centre."""
+    return f"at {min(asked_m_per_s, speeds.linear_m_per_s):g} m/s"
 
 
 def _opens_to(step: steps.ReleaseStep, gripper: GripperModel | None) -> str:
@@ -363,7 +373,7 @@ def _twist(step: steps.TwistStep, turn: Turn, speeds: Speeds) -> str:
         first = f", {way}" if turns_once else f", first {way}"
     then = f"holds each for {step.hold_s:g} s" + (" and returns" if step.return_to_start else "")
     times = f", {step.repeats} times" if step.repeats > 1 else ""
-    return f"twists the wrist to {places} {since}{first}, {then}{times}, {speeds.turning(step.speed_rad_per_s)}"
+    return f"twists the wrist to {places} {since}{first}, {then}{times}, {_turning(step.speed_rad_per_s, speeds)}"
 
 
 def _turns_back(step: Step, begins: steps.Direction | None) -> bool:

@@ -21,14 +21,6 @@ class Speeds(NamedTuple):
     wrist_rad_per_s: float = math.inf
     linear_m_per_s: float = math.inf
 
-    def turning(self, asked_rad_per_s: float) -> str:
-        """Return in words how fast a step turns the wrist."""
-        return f"at {min(asked_rad_per_s, self.wrist_rad_per_s):g} rad/s"
-
-    def moving(self, asked_m_per_s: float) -> str:
-        """Return in words how fast a step moves the tool centre."""
-        return f"at {min(asked_m_per_s, self.linear_m_per_s):g} m/s"
-
 
 AS_ASKED: Final = Speeds()
 

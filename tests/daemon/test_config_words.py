@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.drivers import hosts
+from shearloop.drivers import name_look_up
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import why_no_address, why_no_host
 from shearloop.drivers.ur.settings import read_settings
@@ -125,7 +125,7 @@ def answer_with(*addresses: str) -> Callable[..., list[tuple[Any, ...]]]:
     ],
 )
 def test_a_robot_and_its_gripper_are_not_given_by_a_name(addresses, cure, tmp_path, monkeypatch, ran):
-    monkeypatch.setattr(hosts.socket, "getaddrinfo", answer_with(*addresses))
+    monkeypatch.setattr(name_look_up.socket, "getaddrinfo", answer_with(*addresses))
     name = "is a name, which can mean another device"
     content = yaml.safe_dump({"gripper": {"socket": {"host": "ur5.lab"}}, "robot": "ur.yaml"})
     assert f"gripper.socket.host: 'ur5.lab' {name} {cure}" in refusal(tmp_path, content)
@@ -145,8 +145,8 @@ def test_a_name_server_that_does_not_answer_delays_the_message_for_a_moment(monk
         answered.wait()
         return []
 
-    monkeypatch.setattr(hosts.socket, "getaddrinfo", answer_late)
-    monkeypatch.setattr(hosts, "RESOLVED_WITHIN_S", 0.05)
+    monkeypatch.setattr(name_look_up.socket, "getaddrinfo", answer_late)
+    monkeypatch.setattr(name_look_up, "RESOLVED_WITHIN_S", 0.05)
     try:
         assert why_no_address("ur5.lab").endswith("it cannot be looked up now: write the device's address")
     finally:

@@ -13,6 +13,7 @@ from shearloop.daemon.robot_files import RobotFiles
 from shearloop.errors import UserError
 from shearloop.tools.commission import boards, gripper, identity, tool
 from shearloop.tools.commission.operator import Operator, Played
+from shearloop.tools.left_tool import left_tool
 
 # Stages that open the fingers.
 _OPENING: Final = (gripper.STAGE, boards.STAGE, tool.STAGE)
@@ -52,7 +53,7 @@ class LeftRobot:
         if not left.keeps:
             return left
         state = read_memories(files)
-        held = state.held
+        held = left_tool(state)
         shown = [*(fault.cause for fault in state.faults), *([held] if held else [])]
         if not shown:
             return left
@@ -87,7 +88,7 @@ class LeftRobot:
             self._keep(replace(self.state, running=""))
 
     def _secured(self, stage: str) -> Operator:
-        held = self.state.held
+        held = left_tool(self.state)
         if held and self.opens and stage in _OPENING:
             self.operator.act(f"{held[0].upper()}{held[1:]}. Stage {stage} opens the fingers, and it drops: secure it")
             self._keep(Remembered())

@@ -25,6 +25,7 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.command_handler import BEING_MADE_READY
 from shearloop.drivers.ur.motion import NOT_OURS
+from shearloop.tools.left_tool import left_tool
 from tests.daemon.control.loop_rig import CONFIG, EIT, FILES, GRIP, Rig, memory_of, new_loop, phase, started, stop
 from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 from tests.fixtures.daemons import DEADLINE_S
@@ -125,7 +126,7 @@ def test_the_angle_of_a_grip_is_remembered_and_forgotten_with_the_grip():
 def test_the_stated_diameter_is_kept_with_the_grip_and_forgotten_with_it(then):
     rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 0.1}, tool_mm=20.0)
     rig.run(5)
-    assert "with a stated diameter of 20 mm" in Remembered.of(rig.control_loop).held
+    assert "with a stated diameter of 20 mm" in left_tool(Remembered.of(rig.control_loop))
     after = after_restart(rig)
     if then == "released":
         after.force_n = 0.0

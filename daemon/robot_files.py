@@ -48,9 +48,9 @@ def memory_path(host: str) -> Path:
 def _is_of_address(name: str) -> bool:
     """Return whether a file of a state is named by an address, or by `localhost`, which is one."""
     spelling = name.removeprefix("robot-").removesuffix(".json")
-    # An address of IPv6 has `_` for its colons, and for the sign before its interface.
-    numbers = spelling.replace("_", ":")
-    return spelling == "localhost" or is_address(numbers) or is_address(numbers.rpartition(":")[0])
+    # An address of IPv6 has `_` for its colons, and before its interface, whose name may have more of them.
+    parts = spelling.split("_")
+    return spelling == "localhost" or any(is_address(":".join(parts[:end])) for end in range(1, len(parts) + 1))
 
 
 def _file(spelling: str, suffix: str, of: str = "robot") -> Path:

@@ -50,10 +50,12 @@ class TorqueSample:
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Treat NaN and infinity as no torque."""
-        if self.torque_nm is not None and not math.isfinite(self.torque_nm):
-            object.__setattr__(self, "reason", f"it measured {self.torque_nm}, which is no number")
-            object.__setattr__(self, "torque_nm", None)
+        """Treat NaN and infinity as no torque, also at the ends of its band."""
+        numbers = [number for number in (self.torque_nm, self.low_nm, self.high_nm) if number is not None]
+        if odd := [number for number in numbers if not math.isfinite(number)]:
+            object.__setattr__(self, "reason", f"it measured {odd[0]}, which is no number")
+            for key in ("torque_nm", "low_nm", "high_nm"):
+                object.__setattr__(self, key, None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

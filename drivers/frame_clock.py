@@ -18,6 +18,11 @@ SPACING_FRAMES = 4
 LONGEST_GAP = 2.5
 # A period further from the usual spacing is a burst of late frames. So are spacings whose middle half differs by more.
 PLAUSIBLE = 0.05
+# So many frames in a row are late by the same time, in periods, after a short pause of the board. A busy computer
+# delays each frame by another time. A wrong period makes frames later than the phase by less than the minimum.
+EQUALLY_LATE = 4
+SAME_LATENESS = 0.05
+MIN_LATENESS = 0.3
 # Spacings that scatter by more than this fraction about their median are of a burst, or of a reader that was away.
 STEADY = 0.25
 
@@ -33,8 +38,8 @@ class FrameClock:
     `learned`.
 
     A frame is late, or the board paused before it and has a new phase. A pause of more than `longest_gap` periods shows
-    at once. A shorter one shows by two frames that are equally late, later than LATE_NS. The phase of the last frames
-    follows what is shorter still.
+    at once. One of more than LATE_NS shows by two frames that are later than that. A shorter one shows by EQUALLY_LATE
+    frames in a row. The phase of the last frames follows what is shorter still.
     """
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
@@ -50,9 +55,10 @@ class FrameClock:
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
         # (frame number, arrival) of the frames that did not wait, since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
-        # When the last frame would have arrived at a reader that is never late, and how late it came, in periods.
+        # When the last frame would have arrived at a reader that is never late.
         self._straight_ns = 0
-        self._late = 0.0
+        # How late the last frames came, in periods.
+        self._lateness: deque[float] = deque([0.0], maxlen=EQUALLY_LATE - 1)
 
     def restart(self) -> None:
         """Forget the phase and keep the period: the board was restarted."""
@@ -88,7 +94,7 @@ class FrameClock:
         phase = islice(reversed(self._seen), PHASE_WINDOW)
         by_phase = (seen_ns + (self._number - n) * self._exact_period_ns for n, seen_ns in phase)
         self._straight_ns = round(min([arrival_ns, *by_phase]))
-        self._late = (found_ns - self._straight_ns) / self._exact_period_ns
+        self._lateness.append((found_ns - self._straight_ns) / self._exact_period_ns)
         return self._straight_ns
 
     def _periods_to(self, t_ns: int) -> float:
@@ -106,10 +112,13 @@ class FrameClock:
     def _has_paused(self, earliest_ns: int, found_ns: int, steps: int) -> bool:
         """Return whether the board stopped before a frame, which came at `earliest_ns` at the earliest."""
         unnoticed = LATE_NS / self._exact_period_ns
-        late, before = self._periods_to(found_ns) - steps, self._late
+        late, before = self._periods_to(found_ns) - steps, self._lateness[-1]
         # Frames that waited come in a burst, each less late than the one before.
-        equally_late = min(late, before) > max(0.5, unnoticed) and late > before - 0.5
-        return equally_late or self._periods_to(earliest_ns) > max(self._longest_gap, unnoticed)
+        long = min(late, before) > max(0.5, unnoticed) and late > before - 0.5
+        row = [*self._lateness, late]
+        same = max(row) - min(row) < SAME_LATENESS and min(row) > MIN_LATENESS
+        short = len(row) == EQUALLY_LATE and same
+        return long or short or self._periods_to(earliest_ns) > max(self._longest_gap, unnoticed)
 
     def _take(self, arrival_ns: int) -> None:
         """Take a frame that shows the board's phase and period."""

@@ -102,6 +102,8 @@ class Bridge:
             status = await self._request({"command": "status"}, COMMAND_TIMEOUT_S)
         except UserError as error:
             raise UserError(f"{error}. `{name}` was not sent") from error
+        if not status["ok"]:
+            raise UserError(f"{status['reason']}. `{name}` was not sent")
         self._check_shown(status.get("daemon", {}), "nothing was sent to it")
         # The daemon, or this process, may have stood still since the click.
         age_s = self.moments.since_s(clicked_ns) if clicked_ns is not None else 0.0
@@ -150,7 +152,9 @@ class Bridge:
             if waits:
                 raise UnansweredError(str(error)) from error
             raise
-        self._check_shown(reply, "that one was stopped")
+        # A refusal names no daemon, and stopped none.
+        if reply["ok"]:
+            self._check_shown(reply, "that one was stopped")
         return reply
 
     async def _request(self, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:

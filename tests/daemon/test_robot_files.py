@@ -62,7 +62,7 @@ async def test_a_stop_under_a_name_stops_every_robot_until_a_person_removes_its_
     assert read_memories(files) == grip, "the other name keeps no stop"
 
 
-@pytest.mark.parametrize("host", ["192.168.1.10", "localhost", "2001:db8::1", "fe80::1%eth0"])
+@pytest.mark.parametrize("host", ["192.168.1.10", "localhost", "2001:db8::1", "fe80::1%eth0", "fe80::1%my_eth_0"])
 def test_a_state_under_an_address_stops_no_other_robot(host):
     write_memory(RobotFiles(host).state, Remembered(stop=(STOP,)))
     # Another version kept it under both.

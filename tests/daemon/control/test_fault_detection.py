@@ -82,6 +82,13 @@ def test_a_torque_that_is_missing_without_a_reason_is_not_quoted():
     assert "right says: it measured nan, which is no number." in no_number[FaultCode.ESTIMATE_INVALID]
 
 
+@pytest.mark.parametrize("band", [(0.1, float("nan")), (float("-inf"), 0.1)])
+def test_a_band_without_numbers_at_its_ends_is_no_torque(band):
+    sample = TorqueSample("skin", 0.1, "", 0, 0, *band)
+    assert (sample.torque_nm, sample.low_nm, sample.high_nm) == (None, None, None)
+    assert "no number" in sample.reason
+
+
 def test_what_measures_no_torque_is_watched_for_silence_alone():
     left = TorqueSource(name="left", period_s=0.5412, measures_torque=False)
     heard = torque(EIT, 0.1), torque(LOAD, 0.1)

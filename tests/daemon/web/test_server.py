@@ -79,8 +79,11 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
 
         return handle
 
+    async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"tasks": {}}
+
     publish, commands = f"ipc://{tmp_path}/publish", f"ipc://{tmp_path}/commands"
-    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop")} | other
+    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop")} | {"status": status} | other
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
         daemon = CommandServer(context, commands, handlers, Refusals())
@@ -316,6 +319,19 @@ async def test_a_page_that_shows_one_daemon_moves_no_other_one_and_says_which_it
             assert (code, reply["ok"]) == (answers, answers == 200)
         assert "process 22: that one was stopped" in reply["reason"]
         assert len(page.asked) == len(NEEDS_TOKEN), "nothing was sent to the other daemon"
+
+
+async def test_a_refusal_is_told_as_it_is_and_not_as_another_daemons(tmp_path):
+    async def refuse(_request: Mapping[str, Any]) -> dict[str, Any]:
+        raise CommandRefusedError("too many requests")
+
+    async with served(tmp_path, status=refuse, stop=refuse) as page:
+        shown = {"source": "daemon", "timestamp": 0.0, "t_mono_ns": 0, "seq": 0, "topic": "health"}
+        page.bridge.latest.add("health", {**shown, "process": 22, "instance": "a1"}, 0.0)
+        code, reply = await post(page, "/stop")
+        assert (code, reply["reason"]) == (409, "too many requests")
+        code, reply = await post(page, "/commands/pause", **BEARER)
+        assert (code, reply["reason"]) == (503, "too many requests. `pause` was not sent")
 
 
 async def test_wrong_tokens_are_soon_refused_unread_and_seldom_logged(tmp_path, log):

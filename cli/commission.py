@@ -1,6 +1,7 @@
 """`shearloop commission`: measure what a rig does, stage after stage, into a report."""
 
 import argparse
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,6 +16,12 @@ from shearloop.errors import UserError
 if TYPE_CHECKING:
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.daemon.config import DaemonConfig
+
+# What a daemon is told that starts meanwhile, and who sends it a command.
+_HOLDER = (
+    "`shearloop commission` (process {}) has the robot of {}: wait for its end, end it with Ctrl-C in its terminal, or "
+    "press the emergency stop"
+)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the stages, and write report and page."""
     from dataclasses import replace
 
+    from shearloop.cli.other_daemon import held_from_daemons
     from shearloop.cli.terminal import print_result
     from shearloop.daemon.commissioning import commissioning_of
     from shearloop.daemon.config import load_daemon_config
@@ -59,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
         if args.emulate:
             config, devices = emulating.enter_context(_emulated(config, args.config, terminal))
             order = devices.order
+        else:
+            emulating.enter_context(held_from_daemons(config.commands, _HOLDER.format(os.getpid(), args.config)))
         # A script may answer for emulated devices.
         allows = config.emulated or sys.stdin.isatty()
         operator = Operator(terminal.answer, terminal.say, order, allows)

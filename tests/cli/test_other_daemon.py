@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from shearloop.cli import demo, other_daemon
+from shearloop.cli.other_daemon import held_from_daemons
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
@@ -56,3 +57,17 @@ def test_a_daemon_that_does_not_answer_is_refused_before_emulators_start(config,
     path = str(config(emulators=[{"device": "hx711", "arguments": ["--link", "load"]}]))
     with closing(StopSocket(f"ipc://{tmp_path}/commands", {}, Refusals())):
         assert "is another daemon running? Stop it, or choose another port" in mistake("run", path)
+
+
+def test_no_daemon_and_no_second_command_begins_while_a_command_holds_the_address(config, mistake, ran, tmp_path):
+    """By any user, at any time: it binds the name of the daemons' stop socket."""
+    commands, holder = f"ipc://{tmp_path}/held", "`shearloop commission` (process 7) has the robot: wait for its end"
+    path = str(config(commands=commands))
+    with held_from_daemons(commands, holder):
+        assert holder in mistake("run", path)
+        assert holder in ran("command", "stop", "--connect", commands, status=1).err
+        with pytest.raises(UserError, match="cannot be bound"):
+            StopSocket(commands, {}, Refusals())
+        with pytest.raises(UserError, match="process 7"), held_from_daemons(commands, "another"):
+            pass
+    StopSocket(commands, {}, Refusals()).close()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from itertools import cycle
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,7 +24,10 @@ from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.widths import WidthCalibration
+from shearloop.drivers.ur.control_box import ControllerInfo
+from shearloop.drivers.ur.script import LOWER
 from shearloop.emulators.boards import Hx711Board
+from shearloop.tools import robot_use
 from tests.running import running
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")
@@ -200,6 +204,17 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
             calibrate.hear("The fingers will open")
             calibrate.end()
     assert read_memory(memory_path("127.0.0.1")).running == "loosen", "the arm waits for its own acknowledgement"
+
+
+def test_a_gripper_on_a_robot_that_another_program_commands_is_not_calibrated(tmp_path, mistake, monkeypatch):
+    """It may be a daemon of another user or computer, which has no lock here, and hold a tool."""
+    info = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=LOWER)
+    monkeypatch.setattr(robot_use, "query_controller", lambda *_: info)
+    monkeypatch.setattr(robot_use, "read_outputs", lambda *_: SimpleNamespace(runtime_state=2))
+    given = ("--host", "127.0.0.9", "--diameter-mm", "10", "--diameter-mm", "40", "--out", tmp_path / "gripper.yaml")
+    said = mistake("calibrate", "gripper", *given)
+    assert "those from 24 on are in use" in said
+    assert "A program is on the robot that was not started from here (playing)" in said
 
 
 COMMISSIONING = """

@@ -8,6 +8,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Report
 from shearloop.daemon.config import DaemonConfig
 from shearloop.drivers.ur.control_box import ControllerInfo
+from shearloop.drivers.ur.rtde import registers_in_use
 from shearloop.drivers.ur.script import UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
@@ -19,10 +20,18 @@ from shearloop.tools.commission.mover import Mover
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.rig import Rig
+from shearloop.tools.robot_use import other_programs, registers_in_words
 
 # With fewer stops of each layer a report raises no speed.
 STOPS_NEEDED: Final = 5
 _STOPS_WITHIN_S: Final = 5.0
+# The clock of our program changes with each cycle.
+_CLOCK_S: Final = 0.25
+_CLOCK_SAMPLES: Final = 5
+_REPLACED: Final = (
+    "Another program plays on the robot: a daemon of another user or computer, or the pendant, has replaced the "
+    "commissioning's. It may hold a tool. The commissioning replaces it."
+)
 # A joint that has moved by more between a question and its answer makes another pose.
 _SAME_POSE_RAD: Final = 0.01
 
@@ -62,6 +71,8 @@ class Context:
     _mover: Mover | None = field(default=None, init=False)
     # Where the arm stood when the operator confirmed it.
     _confirmed: Seen | None = field(default=None, init=False)
+    # The signs of other programs that the operator has accepted.
+    _accepted: set[str] = field(default_factory=set, init=False)
 
     @property
     def clock(self) -> Clock:
@@ -84,6 +95,32 @@ class Context:
         if self._observer is None:
             self._observer = self.opened.enter_context(self.rig.observer(self.registers))
         return self._observer
+
+    def expect_no_other_program(self) -> None:
+        """Return once nothing else commands the robot, or the operator accepts what does; raises DeclinedError.
+
+        Raises UserError where others write all registers. A program is asked about each time; it would be replaced.
+        """
+        if self._mover is not None:
+            # The observer hears the robot all the time. Our program counts on, and nobody else can write its clock.
+            if self._another_plays():
+                self.operator.accept(_REPLACED)
+            return
+        seen = self.rig.controller()
+        if seen.registers is None:
+            raise registers_in_use(self.settings.host)
+        for sign in other_programs(seen, self.rig.outputs(self.registers)):
+            if sign not in self._accepted:
+                self.operator.accept(f"{sign} The commissioning replaces such a program, and moves robot and gripper.")
+                # A program is replaced; a client keeps its registers.
+                self._accepted.update({sign} if registers_in_words(seen) in sign else ())
+
+    def _another_plays(self) -> bool:
+        """Return whether a program plays whose clock, in the registers that we write, stands still."""
+        self.observer.forget()
+        samples = self.observer.listen(_CLOCK_S)
+        ticks = {seen.outputs.script_ticks for seen in samples}
+        return len(samples) >= _CLOCK_SAMPLES and all(seen.plays for seen in samples) and len(ticks) == 1
 
     @property
     def mover(self) -> Mover:

@@ -12,6 +12,7 @@ from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.robot_use import FREE, program_in_words, registers_in_words
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
@@ -67,13 +68,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         ),
         judged("robot mode", seen.robot_mode, "RUNNING", "ready to move", passed=seen.robot_mode == "RUNNING"),
         judged("safety mode", seen.safety_mode, "NORMAL", "ready to move", passed=seen.safety_mode == "NORMAL"),
-        judged(
-            "registers",
-            "free" if seen.registers is not None else "in use",
-            "free",
-            "no other program commands the robot",
-            passed=seen.registers is not None,
-        ),
+        *_other_programs(seen, outputs),
         judged(
             "speed slider", f"{slider:.0%}", "100%", "the loop's gain", passed=math.isclose(slider, 1.0, abs_tol=1e-6)
         ),
@@ -93,6 +88,21 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         if isinstance(section, SerialDevice) and section.serial_number is not None
     ]
     return tuple(lines)
+
+
+def _other_programs(seen: ControllerInfo, outputs: RtdeOutputs) -> list[Line]:
+    """Return the lines on other programs. Where some registers are left, the operator is asked before stage 1."""
+    registers, program = registers_in_words(seen), program_in_words(outputs)
+    promise = "no other program commands the robot"
+    if seen.registers is not None and registers != FREE:
+        lines = [Line(what="registers", value=f"{registers}: another program may command the robot", limit=FREE)]
+    else:
+        lines = [judged("registers", registers, FREE, promise, passed=registers == FREE)]
+    if program:
+        lines.append(Line(what="program on the robot", value=f"{program}, and not of the commissioning", limit="none"))
+    else:
+        lines.append(judged("program on the robot", "none", "none", promise, passed=True))
+    return lines
 
 
 def _polyscope(version: str) -> Line:

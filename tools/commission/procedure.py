@@ -120,6 +120,9 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
         ]:
             raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
+        if stage != identity.STAGE:
+            # A daemon of another computer may have begun since the last stage.
+            context.expect_no_other_program()
         with left.during(stage) as context.operator:
             measured = measure(context)
         result = StageResult(

@@ -18,7 +18,6 @@ from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.drivers.ur.control_box import ControllerInfo, query_controller
 from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.rtde import register_round_trip
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
@@ -30,6 +29,7 @@ from shearloop.tools.commission.mover import Mover, MoverProcess
 from shearloop.tools.commission.observer import Observer
 from shearloop.tools.commission.observer_process import ObserverProcess
 from shearloop.tools.fingertip_table import fingertip_table
+from shearloop.tools.robot_use import read_outputs
 
 
 class Rig(Protocol):
@@ -83,12 +83,7 @@ class ConnectedRig:
 
     def outputs(self, registers: ScriptRegisters) -> RtdeOutputs:
         """Return the controller's present outputs; raises RobotLostError if it does not answer."""
-        settings = self._settings
-        receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s, registers, writes=False)
-        try:
-            return receiver.latest()
-        finally:
-            receiver.close()
+        return read_outputs(self._settings.host, self._settings.connect_timeout_s, registers)
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""

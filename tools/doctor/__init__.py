@@ -103,6 +103,10 @@ def check_daemon_and_devices(config: DaemonConfig, config_path: Path, seconds: f
         return
     if reply is None:
         yield good("daemon", "not running with this configuration: the devices are free")
+    elif reply.get("ok") is False:
+        what, _, cure = str(reply.get("reason")).partition(": ")
+        yield trouble("daemon", what, "no daemon starts meanwhile, and the robot may move", cure)
+        return
     elif not reply:
         found = f"a daemon has the address {config.commands} and does not answer within {DAEMON_TIMEOUT_S:g} s"
         means = "it hangs, or the computer is too busy; it may be this configuration's, and have the devices"

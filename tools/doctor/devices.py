@@ -27,7 +27,6 @@ from shearloop.drivers.ur.control_box import check_generation, check_ports, quer
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.primary_port import PrimaryPort
-from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
@@ -40,6 +39,7 @@ from shearloop.tools.doctor.boards import (
     table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.tools.robot_use import FREE, registers_in_words
 from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
@@ -143,9 +143,12 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
     else:
         cure = "make the cell safe, start the daemon, then send `shearloop command unlock`"
         yield note("robot's mode", mode, "the arm does not move in this mode", cure)
-    if seen.registers is not None:
-        halves = "free" if seen.registers is UPPER else "those from 24 on are in use, and the lower ones free"
-        yield good("robot's registers", halves)
+    registers = registers_in_words(seen)
+    if registers == FREE:
+        yield good("robot's registers", registers)
+    elif seen.registers is not None:
+        means = "a daemon of another user or computer, another RTDE client or a fieldbus may command the robot"
+        yield note("robot's registers", registers, means, "end the other program if it commands the robot")
     else:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
         cure = "close the other program, or disable the adapter under Installation → Fieldbus"

@@ -5,7 +5,7 @@ import json
 import math
 import re
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,15 +14,17 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from shearloop.cli import main
+from shearloop.cli import main, other_daemon
 from shearloop.daemon.commissioning import Line, Report, StageResult
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.limits import tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.script import UPPER
+from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.drivers.ur.settings import InstalledTool, read_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission import identity
@@ -80,6 +82,26 @@ def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
     lines = judge_identity(found, read_settings(config.robot), config)
     assert [line.what for line in lines if line.verdict == "failed"] == failed
     assert "7583" in [line.value for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("version", "registers", "verdict"),
+    [("5.17.3.0", UPPER, "passed"), ("5.17.3.0", LOWER, "noted"), ("5.23.0.0", LOWER, "passed")],
+)
+def test_registers_that_another_client_has_are_not_free(tmp_path, version, registers, verdict):
+    """A new controller has the lower half alone for us."""
+    config = load_daemon_config(write_rig(tmp_path))
+    found = seen(version=version, registers=registers)
+    (line,) = (line for line in judge_identity(found, read_settings(config.robot), config) if line.what == "registers")
+    assert line.verdict == verdict
+    assert ("from 24 on are in use" in line.value) == (verdict == "noted")
+
+
+def test_a_program_that_plays_before_the_commissioning_is_no_pass(tmp_path):
+    config = load_daemon_config(write_rig(tmp_path))
+    found = replace(GOOD, outputs=replace(OUTPUTS, runtime_state=2))
+    (line,) = (line for line in judge_identity(found, read_settings(config.robot), config) if "program" in line.what)
+    assert (line.verdict, "playing" in line.value) == ("noted", True)
 
 
 def test_stage_0_and_the_daemon_refuse_the_same_tools(tmp_path):
@@ -187,6 +209,19 @@ def test_a_robot_that_a_daemon_drives_is_not_commissioned(tmp_path, mistake):
     path = write_rig(tmp_path, "127.0.0.9")
     with lock_robot(RobotFiles("127.0.0.9")):
         assert "driven by another program" in mistake("commission", path, "--out", tmp_path / "report.yaml")
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_robot_of_another_users_daemon_is_not_commissioned(tmp_path, mistake, monkeypatch):
+    """Its lock is in another folder of states."""
+    path = write_rig(tmp_path, "127.0.0.9")
+    commands = load_daemon_config(path).commands
+    monkeypatch.setattr(other_daemon, "STATUS_S", 0.01)
+    with closing(StopSocket(commands, {}, Refusals())):
+        assert "is taken" in mistake("commission", path, "--out", tmp_path / "report.yaml")
+    reply = {"ok": True, "daemon": {"process": 4711, "rig": "lab", "folder": "/opt/lab"}}
+    monkeypatch.setattr(other_daemon, "send_to_stop_socket", lambda *_: reply)
+    assert "process 4711 (lab) in /opt/lab" in mistake("commission", path, "--out", tmp_path / "report.yaml")
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -325,6 +325,22 @@ def test_a_cable_that_was_pulled_too_shortly_or_not_at_all_is_asked_for_again(la
     assert ("not interrupted" in line.value) == (verdict == "failed")
 
 
+def test_a_program_that_replaced_the_commissionings_is_asked_about_before_the_next_stage(lab):
+    """As a daemon of another computer uploads it: the clock of our script stands still while a program plays."""
+    config = load_daemon_config(lab.path)
+    with ExitStack() as opened:
+        settings, controller, operator = open_settings(config), lab.rig.controller(), lab.operator.operator
+        context = Context(config, settings, lab.rig, controller, operator, None, COUNTS, opened)
+        context.ready()
+        context.expect_no_other_program()
+        assert lab.operator.asked == [], "our own program plays"
+        outputs = lab.rig.outputs
+        lab.rig.outputs = lambda registers: replace(outputs(registers), script_ticks=7)
+        lab.operator.declined = "Another program plays"
+        with pytest.raises(DeclinedError):
+            context.expect_no_other_program()
+
+
 def test_an_emergency_stop_of_a_wrist_that_stands_is_none(lab):
     """A swing ends by itself while nobody presses."""
     lab.do_instead("emergency-stop", [["object none"] * 80 + ["emergency-stop"]])

@@ -1,6 +1,7 @@
 """The order of the stages: what is measured is kept, a failed stage ends it, and a later run continues."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -9,17 +10,18 @@ import yaml
 from shearloop.daemon.commissioning import Line, Verdict, load_report
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.ur.control_box import ControllerInfo
-from shearloop.drivers.ur.script import UPPER
+from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.tools.commission import procedure
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.operator import WORD, DeclinedError, Operator
 from shearloop.tools.commission.report import Measured
-from tests.tools.commission.test_commission import write_rig
+from tests.tools.commission.test_commission import OUTPUTS, write_rig
 
 CONTROLLER = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=UPPER)
 
 
-RIG = SimpleNamespace(controller=lambda: CONTROLLER)
+RIG = SimpleNamespace(controller=lambda: CONTROLLER, outputs=lambda _: OUTPUTS)
 
 
 def play_stages(monkeypatch: pytest.MonkeyPatch, verdicts: Mapping[str, Verdict]) -> list[str]:
@@ -86,3 +88,51 @@ def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
     assert run() == ["1 b", "2 c"]
     assert run() == []
     assert run("2") == ["2 c"], "a named stage is run again"
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize(
+    ("registers", "runtime_state", "said"),
+    [(LOWER, 1, "those from 24 on are in use"), (UPPER, 2, "(playing)"), (UPPER, 4, "(paused)")],
+)
+def test_another_program_on_the_robot_is_named_before_each_stage_that_moves(
+    tmp_path, monkeypatch, registers, runtime_state, said
+):
+    """It may be a daemon's of another user or of another computer, which no lock of this one shows."""
+    ran = play_stages(monkeypatch, dict.fromkeys(("0 identity", "1 b", "2 c"), "passed"))
+    path, out, asked = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
+    controller, outputs = replace(CONTROLLER, registers=registers), replace(OUTPUTS, runtime_state=runtime_state)
+    rig = SimpleNamespace(controller=lambda: controller, outputs=lambda _: outputs)
+
+    def run(word: str) -> None:
+        def answer(question: str) -> str:
+            asked.append(question)
+            return word if "Type `continue`" in question else WORD
+
+        operator = Operator(answer, lambda _: None, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), (), rig)
+
+    with pytest.raises(DeclinedError, match="not accepted"):
+        run("no")
+    assert ran == ["0 identity"], "nothing moves before the word"
+    assert said in next(question for question in asked if "Type `continue`" in question)
+    run("continue")
+    assert ran == ["0 identity", "1 b", "2 c"]
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_robot_whose_registers_are_all_taken_is_not_moved_by_a_later_run(tmp_path, monkeypatch):
+    """Stage 0 passed earlier."""
+    ran = play_stages(monkeypatch, {"0 identity": "passed", "3 b": "passed"})
+    path, out = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml"
+    taken = replace(CONTROLLER, registers=None)
+
+    def run(only: str, controller: ControllerInfo) -> None:
+        rig = SimpleNamespace(controller=lambda: controller, outputs=lambda _: OUTPUTS)
+        operator = Operator(lambda _: WORD, lambda _: None, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, rig)
+
+    run("0", CONTROLLER)
+    with pytest.raises(RobotLostError, match="already in use"):
+        run("3", taken)
+    assert ran == ["0 identity"]

@@ -49,9 +49,9 @@ def run(args: argparse.Namespace) -> int:
     """Run the stages, and write report and page."""
     from dataclasses import replace
 
-    from shearloop.cli.other_daemon import held_from_daemons
+    from shearloop.cli.held_address import held_from_daemons
     from shearloop.cli.terminal import print_result
-    from shearloop.daemon.commissioning import commissioning_of
+    from shearloop.daemon.commissioned import commissioning_of
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts

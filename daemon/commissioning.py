@@ -1,18 +1,15 @@
-"""The report of a rig's commissioning, the limits that it allows, and the cap on a robot without a valid report.
+"""The limits that the report of a rig's commissioning allows, and the cap on a robot without a valid report.
 
 The report is a record, not a safety function. Only the pendant's safety configuration is rated.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Final, Literal, TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Final, Literal, TypeVar
 
-from pydantic import AwareDatetime
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.rig_identity import Record, RigIdentity, identity_of, judged_by, judged_sha256s, why_not_emulated
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import ModelName
@@ -20,7 +17,6 @@ from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
 from shearloop.errors import UserError
-from shearloop.yaml_files import load_model
 
 Verdict = Literal["passed", "failed", "noted"]
 BoundT = TypeVar("BoundT", bound=Bound)
@@ -29,18 +25,68 @@ BoundT = TypeVar("BoundT", bound=Bound)
 CAPPED_RAD_PER_S: Final = 0.2
 CAPPED_M_PER_S: Final = 0.05
 CAPPED_NM: Final = 0.3
-# A report counts for this time after its oldest stage.
-MAX_AGE_DAYS: Final = 180
-# This computer's clock may be this much behind the clock that dated the report.
-_CLOCKS_DIFFER = timedelta(days=1)
+# A report raises the wrist's speed to this at most.
+FASTEST_RAD_PER_S: Final = 0.5
 # A measured value beyond this multiple of a capped speed stops the motion.
 _HARD: Final = 1.6
-CURE: Final = (
-    "run `shearloop commission CONFIG --out FILE{option}`, then write `commissioned: FILE` into the configuration"
-)
+CURE: Final = "run `shearloop commission CONFIG --out FILE{options}`"
 # The stages that a quantity's limits depend on, by the first figure of their names.
 _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
+
+
+class Record(BaseModel):
+    """A part of a report."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Supplied(Record):
+    """Values that the daemon takes from a stage; a key that is absent was not measured."""
+
+    # Stage 4 tries no faster stop.
+    wrist_speed_rad_per_s: Annotated[float, Field(le=FASTEST_RAD_PER_S)] | None = None
+    torque_nm: float | None = None
+    torque_sources: Mapping[str, str] | None = None
+    """Sources with the right sign and scale up to `torque_nm`, beside the load cell; each with its `source_sha256`."""
+    rest_rad_per_s: float | None = None
+    actuation_s: float | None = None
+    reaction_s: float | None = None
+    stop_rad: float | None = None
+    widths: tuple[tuple[float, float], ...] | None = None
+    """Pairs of counts and mm."""
+
+
+NOTHING_SUPPLIED: Final = Supplied()
+
+
+class RigIdentity(Record):
+    """Which rig a report is about: hashes in hexadecimal, versions, and the robot's serial number."""
+
+    emulated: bool
+    configuration_sha256: str
+    robot_settings_sha256: str
+    script_sha256: str
+    ur_rtde: str
+    polyscope: str
+    robot_serial_number: str
+
+    def differences(self, other: "RigIdentity") -> Iterator[str]:
+        """Yield each difference in words."""
+        for key, what in _IDENTITY.items():
+            if getattr(self, key) != getattr(other, key):
+                yield what
+
+
+_IDENTITY: Final = {
+    "emulated": "`emulated`",
+    "configuration_sha256": "the devices in the configuration",
+    "robot_settings_sha256": "the robot's settings",
+    "script_sha256": "the script for the robot",
+    "ur_rtde": "the version of ur-rtde",
+    "polyscope": "the version of PolyScope",
+    "robot_serial_number": "the robot's serial number",
+}
 
 
 class Line(Record):
@@ -52,22 +98,6 @@ class Line(Record):
     count: int = 1
     promise: str = ""
     verdict: Verdict = "noted"
-
-
-class Supplied(Record):
-    """Values that the daemon takes from a stage; a key that is absent was not measured."""
-
-    wrist_speed_rad_per_s: float | None = None
-    torque_nm: float | None = None
-    rest_rad_per_s: float | None = None
-    actuation_s: float | None = None
-    reaction_s: float | None = None
-    stop_rad: float | None = None
-    widths: tuple[tuple[float, float], ...] | None = None
-    """Pairs of counts and mm."""
-
-
-NOTHING_SUPPLIED: Final = Supplied()
 
 
 class StageResult(Record):
@@ -88,11 +118,6 @@ class StageResult(Record):
     def passed(self) -> bool:
         """Whether no line failed."""
         return all(line.verdict != "failed" for line in self.lines)
-
-    def changed_since(self, hashes: Mapping[str, str]) -> list[str]:
-        """Return the keys and files that this stage judged and that have changed since, for a sentence."""
-        now = judged_by(self.stage, hashes)
-        return [f"`{key}`" for key, own in now.items() if self.judged_sha256s.get(key) != own]
 
 
 class Report(Record):
@@ -125,13 +150,21 @@ class Report(Record):
 
 @dataclass(frozen=True, slots=True)
 class MotionCap:
-    """The largest speeds and torque that a rig's report allows, why no larger ones, and what raises them."""
+    """The largest speeds and torque that a rig's report allows, why no larger ones, and what raises them.
+
+    An experiment that one of `torque_sources` drives may have `torque_nm`, and any other one `CAPPED_NM`.
+    """
 
     why: str
     cure: str = ""
     wrist_speed_rad_per_s: float = CAPPED_RAD_PER_S
     linear_speed_m_per_s: float = CAPPED_M_PER_S
     torque_nm: float = CAPPED_NM
+    torque_sources: tuple[str, ...] = ()
+
+    def torque_nm_of(self, source: str) -> float:
+        """Return the largest torque of an experiment that this source drives."""
+        return self.torque_nm if source in self.torque_sources else CAPPED_NM
 
     @property
     def sentence(self) -> str:
@@ -141,55 +174,59 @@ class MotionCap:
     @property
     def cause(self) -> str:
         """Return the cap in words, without its cure."""
+        sources = f" ({', '.join(self.torque_sources)}; any other source {CAPPED_NM:g} N·m)"
         return (
             f"the robot is capped at {self.wrist_speed_rad_per_s:g} rad/s, {self.linear_speed_m_per_s:g} m/s and "
-            f"{self.torque_nm:g} N·m: {self.why}"
+            f"{self.torque_nm:g} N·m{sources if self.torque_sources else ''}: {self.why}"
         )
 
 
+@dataclass(slots=True)
 class Commissioning:
-    """The robot's settings within its report. An emulated robot needs no report, unless it plays a real robot."""
+    """The robot's settings within its report. An emulated robot needs no report, unless it plays a real robot.
 
-    def __init__(
-        self,
-        settings: UrSettings,
-        report: Report | None,
-        reason: str = "",
-        *,
-        emulated: bool = False,
-        rehearsed: bool = False,
-    ) -> None:
-        """`reason` says why the report, or its absence, raises nothing. It is empty for a report that counts.
+    `reason` says why the report, or its absence, raises nothing. It is empty for a report that counts. `emulated` means
+    a robot without a cap, `rehearsed` an emulated robot with the cap of the real one. The report raises the torque of
+    `torque_sources`. `old_stages` are to be measured again, by their first figures.
+    """
 
-        `emulated` means a robot without a cap, `rehearsed` an emulated robot with the cap of the real one.
-        """
-        self._given, self._report, self._reason, self._emulated = settings, report, reason, emulated
-        self._rehearsed = rehearsed
-        # How the connected controller differs from the report's.
-        self._other = ""
+    given: UrSettings
+    report: Report | None
+    reason: str = ""
+    emulated: bool = False
+    rehearsed: bool = False
+    torque_sources: tuple[str, ...] = ()
+    old_stages: str = ""
+    # How the connected controller differs from the report's.
+    _other: str = field(default="", init=False)
 
     @property
     def cap(self) -> MotionCap | None:
         """The present cap; None for an emulated robot that plays no real robot."""
-        if self._emulated:
+        if self.emulated:
             return None
-        if self._report is None or not self.counts:
-            cure = CURE.format(option=" --emulate" if self._rehearsed else "")
-            return MotionCap(self._reason or self._other, cure)
-        found = self._report.supplied()
-        wrist_rad_per_s = found.wrist_speed_rad_per_s if self._report.has(_SPEED_NEEDS) else None
-        torque_nm = found.torque_nm if self._report.has(_TORQUE_NEEDS) else None
-        devices = " of emulated devices" if self._report.rig.emulated else ""
+        if self.report is None or not self.counts:
+            options = " --emulate" if self.rehearsed else ""
+            if self.old_stages:
+                cure = CURE.format(options=f"{options} --stages {self.old_stages}")
+            else:
+                cure = f"{CURE.format(options=options)}, then write `commissioned: FILE` into the configuration"
+            return MotionCap(self.reason or self._other, cure)
+        found = self.report.supplied()
+        wrist_rad_per_s = found.wrist_speed_rad_per_s if self.report.has(_SPEED_NEEDS) else None
+        torque_nm = (found.torque_nm if self.report.has(_TORQUE_NEEDS) else None) or 0.0
+        devices = " of emulated devices" if self.report.rig.emulated else ""
         return MotionCap(
             f"its report{devices} covers no more",
             wrist_speed_rad_per_s=max(CAPPED_RAD_PER_S, wrist_rad_per_s or 0.0),
-            torque_nm=max(CAPPED_NM, torque_nm or 0.0),
+            torque_nm=max(CAPPED_NM, torque_nm),
+            torque_sources=self.torque_sources if torque_nm > CAPPED_NM else (),
         )
 
     @property
     def settings(self) -> UrSettings:
         """The robot's settings within the cap, with the values that a counting report supplies."""
-        cap, settings = self.cap, self._given
+        cap, settings = self.cap, self.given
         if cap is None:
             return settings
         limits = settings.limits
@@ -214,12 +251,12 @@ class Commissioning:
     @property
     def supplied(self) -> Supplied:
         """The values of a counting report; empty without one."""
-        return self._report.supplied() if self._report is not None and self.counts else NOTHING_SUPPLIED
+        return self.report.supplied() if self.report is not None and self.counts else NOTHING_SUPPLIED
 
     @property
     def counts(self) -> bool:
         """Whether there is a report that raises the limits that its stages cover."""
-        return self._report is not None and not (self._reason or self._other)
+        return self.report is not None and not (self.reason or self._other)
 
     def on_controller(self, polyscope: str, serial_number: str) -> UrSettings:
         """Compare the connected controller with the report's, and return the settings for it.
@@ -227,12 +264,12 @@ class Commissioning:
         A rehearsal has an emulated controller, which is never the report's. Raises RobotLostError for a real controller
         in an emulated rig, because this rig has neither the deadlines nor the cap of a real one.
         """
-        plays = self._emulated or self._rehearsed
-        if plays and (reason := why_not_emulated(self._given.host, serial_number)):
+        plays = self.emulated or self.rehearsed
+        if plays and (reason := why_not_emulated(self.given.host, serial_number)):
             raise RobotLostError("not-emulated", reason)
-        if self._report is not None and not self._rehearsed:
+        if self.report is not None and not self.rehearsed:
             seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
-            differs = list(self._report.rig.differences(self._report.rig.model_copy(update=seen)))
+            differs = list(self.report.rig.differences(self.report.rig.model_copy(update=seen)))
             self._other = f"{' and '.join(differs)} changed since its report" if differs else ""
         return self.settings
 
@@ -242,64 +279,21 @@ class Commissioning:
         return self.cap.sentence if self.cap is not None else ""
 
 
+def why_not_emulated(host: str, robot_serial_number: str) -> str:
+    """Return that the controller at an address is no emulated one, by its serial number, or an empty string."""
+    if robot_serial_number == EMULATED_SERIAL_NUMBER:
+        return ""
+    return (
+        f"The configuration says `emulated: true`, and the controller at {host} is no emulated one: its serial number "
+        f"is {robot_serial_number or 'unknown'}, not {EMULATED_SERIAL_NUMBER}; take `emulated` out for a real robot."
+    )
+
+
 def _lowered(bound: BoundT, cap: float) -> BoundT:
     """Return a bound on a speed that keeps commands at or below the cap, and measured values not far above it."""
     if bound.inner <= cap:
         return bound
     return replace(bound, inner=cap, hard=min(bound.hard, _HARD * cap))
-
-
-def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime | None = None) -> Commissioning:
-    """Return what a rig's report allows at a time, by default now.
-
-    A rehearsal has the cap of the rig that it plays, and a report of emulated devices raises this cap too. Raises
-    UserError for a file that cannot be read or is no report, which is a mistake in the configuration.
-    """
-    rehearsed = config.real is not config
-    if config.emulated and not rehearsed:
-        return Commissioning(settings, None, emulated=True)
-    if config.commissioned is None:
-        return Commissioning(settings, None, "`commissioned` is not in the configuration", rehearsed=rehearsed)
-    report = load_report(config.commissioned)
-    reason = why_not(report, config, now or datetime.now(UTC))
-    return Commissioning(settings, report, reason, rehearsed=rehearsed)
-
-
-def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
-    """Return why a report does not count for a configuration, or an empty string."""
-    seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number)
-    # Each of these marks is enough, so one mistake in a file cannot raise a real robot's cap.
-    is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
-    if is_emulated and not config.emulated:
-        return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
-    # In a rehearsal a report of the real devices counts too.
-    robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
-    seen = seen.model_copy(update=robot)
-    if differs := list(report.rig.differences(seen)):
-        return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
-    hashes = judged_sha256s(config)
-    for stage in report.stages:
-        if differs := stage.changed_since(hashes):
-            keys = " and ".join(differs)
-            cure = f"run `shearloop commission` with `--stages {stage.stage[0]}`"
-            return f"{keys} changed since stage {stage.stage} of {config.commissioned} was measured; {cure}"
-    failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
-              if line.verdict == "failed"]  # fmt: skip
-    if failed:
-        return f"{config.commissioned} says that {failed[0]} failed"
-    if not report.stages:
-        return f"{config.commissioned} has no stage"
-    dates = [stage.date for stage in report.stages]
-    if now - min(dates) > timedelta(days=MAX_AGE_DAYS):
-        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MAX_AGE_DAYS} days"
-    if max(dates) - now > _CLOCKS_DIFFER:
-        return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
-    return ""
-
-
-def load_report(path: Path) -> Report:
-    """Return the report in a file; raises UserError for a file that is not a report."""
-    return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
 
 
 def knows_tool(stated_mm: float | None, config: DaemonConfig, robot: Commissioning | None) -> bool:

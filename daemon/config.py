@@ -151,6 +151,14 @@ class LoadCellConfig(ConfigModel):
     device: SerialDevice = Field(description="the board's serial port")
     calibration: Path | None = Field(None, description="calibration; default: the board sends torques in N·m")
     rate_hz: float = Field(LOAD_CELL_RATE_HZ, gt=0, le=1000, description="lines per second")
+    direction: Literal["clockwise", "counterclockwise"] | None = Field(
+        None, description="the only direction of torques that the lever measures; default: both"
+    )
+
+    @property
+    def only_sign(self) -> int:
+        """The sign of the only torques that the lever measures; 0 for both."""
+        return {None: 0, "clockwise": -1, "counterclockwise": 1}[self.direction]
 
 
 class InstrumentSocket(ConfigModel):

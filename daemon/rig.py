@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, commissioning_of, measured_widths
+from shearloop.daemon.commissioned import commissioning_of
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, measured_widths
 from shearloop.daemon.config import DaemonConfig, GripperConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep

@@ -5,15 +5,15 @@ Keys and files that only some stages judge have separate hashes. After a change 
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
-from pydantic import BaseModel, ConfigDict
-
+from shearloop.daemon.commissioning import RigIdentity
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.script import own_script_hash
@@ -27,6 +27,11 @@ _DEVICE_KEYS: Final[Any] = {
     "load_cell": {"device", "rate_hz"},
     "gripper": {"model", "socket", "modbus"},
 }
+# What changes a torque of the fingertips, beside their calibrations. A calibration names its bank.
+_TORQUE_KEYS: Final[Any] = {
+    "fingertips": {"__all__": {"estimator", "matching", "baseline_frames", "average_frames", "creep"}},
+    "combined": {"estimator", "creep"},
+}
 # Keys and files that only some stages judge, with the first figures of the stages. Of a file only the content counts.
 _JUDGED_BY: Final = {
     "gripper.calibration": "2",
@@ -35,69 +40,30 @@ _JUDGED_BY: Final = {
     "limits.force_n": "5",
     "limits.torque_nm": "5",
     "load_cell.calibration": "67",
+    "load_cell.direction": "7",
 }
 
 
-class Record(BaseModel):
-    """A part of a report."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RigIdentity(Record):
-    """Which rig a report is about: hashes in hexadecimal, versions, and the robot's serial number."""
-
-    emulated: bool
-    configuration_sha256: str
-    robot_settings_sha256: str
-    script_sha256: str
-    ur_rtde: str
-    polyscope: str
-    robot_serial_number: str
-
-    def differences(self, other: "RigIdentity") -> Iterator[str]:
-        """Yield each difference in words."""
-        for key, what in _IDENTITY.items():
-            if getattr(self, key) != getattr(other, key):
-                yield what
-
-
-_IDENTITY: Final = {
-    "emulated": "`emulated`",
-    "configuration_sha256": "the devices in the configuration",
-    "robot_settings_sha256": "the robot's settings",
-    "script_sha256": "the script for the robot",
-    "ur_rtde": "the version of ur-rtde",
-    "polyscope": "the version of PolyScope",
-    "robot_serial_number": "the robot's serial number",
-}
-
-
-def identity_of(config: DaemonConfig, polyscope: str, robot_serial_number: str) -> RigIdentity:
+def identity_of(
+    config: DaemonConfig, polyscope: str, robot_serial_number: str, found: RigIdentity | None = None
+) -> RigIdentity:
     """Return which rig this is, a rehearsal being the one that it plays, on emulated devices.
 
-    Raises UserError where a file that the configuration names cannot be read.
+    A default that is written out changes nothing. A report of an earlier version has another hash of the same devices,
+    and `found` is its identity: if that hash is of this configuration, the result has it. Raises UserError where a file
+    that the configuration names cannot be read.
     """
-    devices = config.real.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
     settings, _ = _settings_of(config)
+    devices = _sha256_of(config.real.model_dump(mode="json", exclude_defaults=True, include=_DEVICE_KEYS))
+    as_written = _sha256_of(config.real.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS))
     return RigIdentity(
         emulated=config.emulated,
-        configuration_sha256=_sha256_of(devices),
+        configuration_sha256=as_written if found is not None and found.configuration_sha256 == as_written else devices,
         robot_settings_sha256=_sha256_of(settings),
         script_sha256=own_script_hash(),
         ur_rtde=_installed("ur-rtde"),
         polyscope=polyscope,
         robot_serial_number=EMULATED_SERIAL_NUMBER if config.emulated else robot_serial_number,
-    )
-
-
-def why_not_emulated(host: str, robot_serial_number: str) -> str:
-    """Return that the controller at an address is no emulated one, by its serial number, or an empty string."""
-    if robot_serial_number == EMULATED_SERIAL_NUMBER:
-        return ""
-    return (
-        f"The configuration says `emulated: true`, and the controller at {host} is no emulated one: its serial number "
-        f"is {robot_serial_number or 'unknown'}, not {EMULATED_SERIAL_NUMBER}; take `emulated` out for a real robot."
     )
 
 
@@ -110,13 +76,27 @@ def judged_sha256s(config: DaemonConfig) -> dict[str, str]:
         "gripper.calibration": gripper.calibration if gripper is not None else None,
         "load_cell.calibration": load_cell.calibration if load_cell is not None else None,
     }
+    if load_cell is not None and load_cell.direction is not None:
+        judged["load_cell.direction"] = load_cell.direction
     hashes = {name: _sha256_of(value) for name, value in judged.items()}
-    return hashes | {name: hashlib.sha256(_content(path)).hexdigest() for name, path in contents.items()}
+    return hashes | {name: _sha256_of_file(path) for name, path in contents.items()}
 
 
 def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:
     """Return the hashes of the keys and files that a stage judges."""
     return {name: own for name, own in hashes.items() if stage[0] in _JUDGED_BY[name]}
+
+
+def source_sha256(config: DaemonConfig, source: str) -> str:
+    """Return the hash of the settings and the calibration behind a source's torques, of a fingertip or of several.
+
+    The stages of a commissioning judge what is behind the load cell and the wrench; their hash is that of no file.
+    Raises UserError where the calibration cannot be read.
+    """
+    real = config.real
+    settings = real.model_dump(mode="json", include=_TORQUE_KEYS)
+    estimated = {**real.fingertips, COMBINED: real.combined}.get(source)
+    return _sha256_of([settings, _sha256_of_file(estimated.calibration)]) if estimated is not None else ""
 
 
 def _settings_of(config: DaemonConfig) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -132,9 +112,10 @@ def _settings_of(config: DaemonConfig) -> tuple[dict[str, Any], dict[str, Any]]:
     return settings, judged | {f"limits.{key}": limits.pop(key) for key in ("force_n", "torque_nm")}
 
 
-def _content(path: Path | None) -> bytes:
+def _sha256_of_file(path: Path | None) -> str:
+    """Return the hash of a file's content, and of nothing without a file; raises UserError."""
     try:
-        return path.read_bytes() if path is not None else b""
+        return hashlib.sha256(path.read_bytes() if path is not None else b"").hexdigest()
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
 

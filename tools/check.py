@@ -189,7 +189,7 @@ def _torque(calibration: "Calibration") -> str:
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
     """Check load cell, gripper and robot; return the robot's settings with their cap, if there are any."""
-    from shearloop.daemon.commissioning import commissioning_of
+    from shearloop.daemon.commissioned import commissioning_of
     from shearloop.daemon.rig import configured_settings, gripper_calibration, why_not_driven
     from shearloop.daemon.sensors import load_cell_calibration
 

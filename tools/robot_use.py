@@ -1,15 +1,21 @@
 """What other programs have of a robot, by the controller's own word: also those of other users and other computers."""
 
+import re
 from contextlib import closing, suppress
+from typing import Final
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import ControllerInfo, query_controller
+from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.drivers.ur.messages import RUNTIME_STATES, RUNTIME_STOPPED, RUNTIME_STOPPING, RtdeOutputs
 from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.script import FIRST_WITH_LOWER_ALONE, LOWER, UPPER, ScriptRegisters
 from shearloop.errors import UserError
 
-FREE = "free"
+FREE: Final = "free"
+# The rated payloads in kg of UR's data sheets, by PolyScope's major version and the dashboard's model. A UR10e of an
+# earlier year is rated 10 kg.
+_RATED_KG: Final = {3: {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}, 5: {"UR3": 3.0, "UR5": 5.0, "UR10": 12.5, "UR16": 16.0}}
 # RTDE's slowest rate that every controller has; one state is enough.
 _ONE_STATE_HZ = 125.0
 
@@ -18,6 +24,23 @@ def read_outputs(host: str, timeout_s: float, registers: ScriptRegisters = UPPER
     """Return a controller's present outputs, without a register to write; DriverError where it does not answer."""
     with closing(RtdeReceiver(host, _ONE_STATE_HZ, timeout_s, registers, writes=False)) as receiver:
         return receiver.latest()
+
+
+def read_rated_kg(host: str, timeout_s: float, major: int) -> tuple[str, float | None]:
+    """Return an arm's model and its rated payload in kg; None for a model that is not known, or not reported.
+
+    `major` is PolyScope's major version. DriverError where the dashboard server does not answer.
+    """
+    (answer,) = ask_dashboard(host, timeout_s, ("get robot model",))
+    model = re.fullmatch(r"(UR\d+)e?", answer.strip())
+    return (model[1], _RATED_KG.get(major, {}).get(model[1])) if model is not None else ("", None)
+
+
+def beyond_rated(payload_kg: float | None, model: str, rated_kg: float | None) -> str:
+    """Return that a payload is beyond the arm's rated one, or an empty string; NaN is a payload that is not known."""
+    if payload_kg is None or rated_kg is None or not payload_kg > rated_kg:
+        return ""
+    return f"{payload_kg:g} kg is above the rated payload of this {model}, {rated_kg:g} kg"
 
 
 def registers_in_words(seen: ControllerInfo) -> str:

@@ -65,10 +65,11 @@ def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[
             )
 
 
-def check_steps(file: ExperimentFile) -> list[Mistake]:
+def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
-    These are the first `hold_torque` on an unidentified tool, and a `tare` of a gripped one.
+    These are the first `hold_torque` on an unidentified tool, and a `tare` of a gripped one. No limit above the `cap`
+    is of use.
     """
     found: list[Mistake] = list(_undoing(file))
     identified = gripped = False
@@ -78,7 +79,10 @@ def check_steps(file: ExperimentFile) -> list[Mistake]:
         for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
             if value >= limit:
                 asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
-                found.append((("steps", number), f"{asks}; raise limits.{key}, or ask for less"))
+                cure = f"raise limits.{key}, or ask for less"
+                if cap is not None and unit == "N·m" and limit + _ROUNDING >= cap.torque_nm_of(file.torque_source):
+                    cure = f"ask for less, because {cap.sentence}"
+                found.append((("steps", number), f"{asks}; {cure}"))
         if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
             asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
             found.append((("steps", number), f"{asks}; raise timeout_s"))
@@ -152,11 +156,12 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
     )
     asked = [(key, getattr(step, key), most, unit) for key, most, unit in speeds if hasattr(step, key)]
     if isinstance(step, TwistingStep):
-        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm, "N·m"))
+        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm_of(file.torque_source), "N·m"))
     for key, value, most, unit in asked:
         # An infinite value stands for one that could not be read.
         if most + _ROUNDING < value < math.inf:
-            return f"has {key} {value:g} {unit}: write {most:g} or less, because {cap.sentence}"
+            less = f", and ask for less than {most:g} {unit}" if key not in ("speed_m_per_s", "speed_rad_per_s") else ""
+            return f"has {key} {value:g} {unit}: write {most:g} or less{less}, because {cap.sentence}"
     return ""
 
 
@@ -202,8 +207,8 @@ def experiment_mistakes(
     """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
     driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     file = outline(content)
-    mistakes = check_steps(file)
     limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
+    mistakes = check_steps(file, cap)
     mistakes += check_devices(file, limits, config.gripper_model, cap)
     if file.torque_source and file.steps:
         mistakes += _undriven(file.torque_source, driving, config)

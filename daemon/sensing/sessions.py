@@ -121,7 +121,10 @@ def torque_sources(
         if (skin := skin_torque_source(config.skin)) is not None:
             sources[skin.name] = skin
     if config.load_cell is not None:
-        sources[LOAD_CELL] = TorqueSource(name=LOAD_CELL, period_s=1.0 / config.load_cell.rate_hz, needs_zero=True)
+        cell = config.load_cell
+        sources[LOAD_CELL] = TorqueSource(
+            name=LOAD_CELL, period_s=1.0 / cell.rate_hz, needs_zero=True, only_sign=cell.only_sign
+        )
     return sources
 
 

@@ -150,7 +150,7 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     return slowed_sentence(sample) or tool_difference(sample, settings.tool)
 
 
-def slowed_sentence(sample: RtdeSample) -> str:
+def slowed_sentence(sample: RtdeOutputs) -> str:
     """Return why the arm turns slower than commanded, or the empty string: a factor on speeds is a gain of the loop."""
     if abs(sample.speed_slider - 1.0) > SCALING_TOLERANCE:
         return (

@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from shearloop.cli import demo, other_daemon
-from shearloop.cli.other_daemon import held_from_daemons
+from shearloop.cli.held_address import held_from_daemons
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket

@@ -1,6 +1,8 @@
 """The cap on a robot that is not commissioned, each reason for it, and what a report raises and supplies."""
 
 import dataclasses
+import hashlib
+import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -9,24 +11,24 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.cli.rehearsed_config import RehearsedConfig
+from shearloop.daemon.commissioned import commissioning_of
 from shearloop.daemon.commissioning import (
     CAPPED_M_PER_S,
     CAPPED_NM,
     CAPPED_RAD_PER_S,
-    MAX_AGE_DAYS,
     NOTHING_SUPPLIED,
     Line,
     Report,
     StageResult,
     Supplied,
-    commissioning_of,
     measured_widths,
 )
+from shearloop.daemon.commissioning_report import MAX_AGE_DAYS
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.rig import make_loop
-from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings
@@ -258,6 +260,111 @@ def test_an_experiment_that_asks_for_more_is_refused_with_its_key_and_a_cure(tmp
     assert "REFUSED" in printed.out
 
 
+def refusal_of(folder: Path, rig: Path, capsys, **limits: float) -> str:
+    """Return why `check` refuses to hold 0.3 N·m with this limit."""
+    steps = [{"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.3, "hold_s": 1}]
+    content = {"name": "one", "torque_source": "load_cell", "limits": limits, "steps": steps}
+    path = folder / "one.yaml"
+    path.write_text(yaml.safe_dump(content))
+    main(["check", str(path), "--config", str(rig)])
+    return capsys.readouterr().err
+
+
+def test_the_advice_under_a_cap_does_not_lead_in_a_circle(tmp_path, capsys):
+    """The limit may be 0.3 N·m, and a task has to be gentler than its limit."""
+    rig = write_rig(tmp_path)
+    above, at = (refusal_of(tmp_path, rig, capsys, torque_nm=limit_nm) for limit_nm in (0.4, 0.3))
+    assert "write 0.3 or less, and ask for less than 0.3 N·m, because the robot is capped" in above
+    assert "asks for 0.3 N·m, and its limit is 0.3 N·m; ask for less, because the robot is capped" in at
+    assert "raise limits.torque_nm" not in at
+
+
+CALIBRATED = {"right": {"device": {"serial_number": "1"}, "calibration": "right.cal"}}
+
+
+def raised_by(folder: Path, **content: object):
+    """Return the cap of a rig whose stage 7 measured the fingertip, with its present configuration."""
+    path = write_rig(folder, fingertips=CALIBRATED)
+    own = source_sha256(load_daemon_config(path), "right")
+    report = report_of(path, "013457", SUPPLIED.model_copy(update={"torque_sources": {"right": own, "wrench": ""}}))
+    save_report(folder / "report.yaml", report)
+    config = load_daemon_config(
+        write_rig(folder, **{"commissioned": "report.yaml", "fingertips": CALIBRATED, **content})
+    )
+    return commissioning_of(config, read_settings(config.robot), NOW)
+
+
+def test_the_raised_torque_is_of_the_sources_that_stage_7_measured(tmp_path):
+    (tmp_path / "right.cal").write_bytes(b"one")
+    found = raised_by(tmp_path)
+    torques = {
+        name: found.cap.torque_nm_of(name) for name in ("load_cell", "right", "wrench", "skin", "left", "combined")
+    }
+    assert torques == {"load_cell": 0.4, "right": 0.4, "wrench": 0.4, "skin": 0.3, "left": 0.3, "combined": 0.3}
+    assert "0.4 N·m (load_cell, right, wrench; any other source 0.3 N·m)" in found.sentence
+
+
+def test_another_calibration_of_a_fingertip_lowers_its_torque_alone(tmp_path):
+    (tmp_path / "right.cal").write_bytes(b"one")
+    cap = raised_by(tmp_path, fingertips={"right": {**CALIBRATED["right"], "creep": {"share": 0.1, "time_s": 9}}}).cap
+    assert (cap.torque_nm_of("load_cell"), cap.torque_nm_of("right")) == (0.4, 0.3)
+    config = load_daemon_config(tmp_path / "rig.yaml")
+    before = source_sha256(config, "right")
+    (tmp_path / "right.cal").write_bytes(b"another")
+    assert source_sha256(config, "right") != before
+
+
+def test_a_report_of_before_raises_the_torque_of_the_load_cell_alone(tmp_path):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "01357", SUPPLIED))
+    assert (found.cap.torque_nm_of("load_cell"), found.cap.torque_nm_of("skin")) == (0.4, 0.3)
+
+
+def test_an_experiment_of_another_source_is_refused_beyond_its_cap(tmp_path, capsys):
+    report = report_of(write_rig(tmp_path), "01357", SUPPLIED)
+    dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
+    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    rig = write_rig(tmp_path, commissioned="report.yaml")
+    step, limits = {"do": "twist", "angles_rad": [0.1]}, {"torque_nm": 0.35}
+    path = tmp_path / "one.yaml"
+    for source, status in (("load_cell", 0), ("wrench", 2)):
+        path.write_text(yaml.safe_dump({"name": "one", "torque_source": source, "limits": limits, "steps": [step]}))
+        assert main(["check", str(path), "--config", str(rig)]) == status, source
+    assert "limits.torque_nm 0.35 N·m: write 0.3 or less" in capsys.readouterr().err
+
+
+def test_a_default_that_is_written_out_keeps_the_report(tmp_path):
+    plain = identity_of(load_daemon_config(write_rig(tmp_path)), VERSION, SERIAL)
+    written = {"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}
+    path = write_rig(tmp_path, **written)
+    assert identity_of(load_daemon_config(path), VERSION, SERIAL) == plain
+    gripper = {"socket": {"host": "192.168.1.10"}}
+    bare = identity_of(load_daemon_config(write_rig(tmp_path, gripper=gripper)), VERSION, SERIAL)
+    gripper["socket"]["port"] = 63352
+    assert identity_of(load_daemon_config(write_rig(tmp_path, gripper=gripper)), VERSION, SERIAL) == bare
+
+
+def test_a_report_whose_configuration_wrote_a_default_out_still_counts(tmp_path):
+    """An earlier version hashed the keys as they were written."""
+    written = {"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}
+    report = report_of(write_rig(tmp_path, **written), "01357", SUPPLIED)
+    as_written = hashlib.sha256(
+        json.dumps({"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}, sort_keys=True).encode()
+    ).hexdigest()
+    found = commissioned(tmp_path, changed(report, configuration_sha256=as_written), **written)
+    assert found.counts
+    assert not commissioned(tmp_path, changed(report, configuration_sha256="0"), **written).counts
+
+
+def test_a_report_that_was_edited_to_a_faster_wrist_is_refused(tmp_path):
+    path = write_rig(tmp_path, commissioned="report.yaml")
+    content = report_of(path, "0134", SUPPLIED).model_dump(mode="json", exclude_none=True)
+    content["stages"][0]["supplies"]["wrist_speed_rad_per_s"] = 3.0
+    (tmp_path / "report.yaml").write_text(yaml.safe_dump(content))
+    config = load_daemon_config(path)
+    with pytest.raises(UserError, match=r"wrist_speed_rad_per_s"):
+        commissioning_of(config, read_settings(config.robot), NOW)
+
+
 async def test_a_running_daemon_refuses_an_experiment_beyond_the_cap(tmp_path):
     path = tmp_path / "one.yaml"
     content = {"name": "one", "limits": {"torque_nm": 0.3}, "steps": [BEYOND[0][0]]}
@@ -319,20 +426,20 @@ CELL = {"tare_counts": 0.0, "scale_n_per_count": 0.001}
 
 
 @pytest.mark.parametrize(
-    ("change", "stage", "key"),
+    ("change", "stages", "key"),
     [
         (lambda at: rewrite(at / "ur.yaml", reaction_s=0.05), "3", "reaction_s"),
-        (lambda at: rewrite(at / "ur.yaml", rest_rad_per_s=0.02), "3", "rest_rad_per_s"),
+        (lambda at: rewrite(at / "ur.yaml", rest_rad_per_s=0.02), "34", "rest_rad_per_s"),
         (
             lambda at: rewrite(at / "ur.yaml", **limits_of(at / "ur.yaml", torque_nm={"inner": 20.0, "hard": 25.0})),
             "5",
             "limits.torque_nm",
         ),
-        (lambda at: rewrite(at / "cell.yaml", scale_n_per_count=0.002), "6", "load_cell.calibration"),
-        (lambda at: rewrite(at / "cell.yaml", tare_counts=5.0, scale_n_per_count=0.002), "6", "load_cell.calibration"),
+        (lambda at: rewrite(at / "cell.yaml", scale_n_per_count=0.002), "67", "load_cell.calibration"),
+        (lambda at: rewrite(at / "cell.yaml", tare_counts=5.0, scale_n_per_count=0.002), "67", "load_cell.calibration"),
     ],
 )
-def test_what_one_stage_judged_makes_that_stage_old_and_no_other(tmp_path, change, stage, key):
+def test_what_some_stages_judged_makes_them_old_and_no_other(tmp_path, change, stages, key):
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(CELL))
     cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
     path = write_rig(tmp_path, load_cell=cell, commissioned="report.yaml")
@@ -342,9 +449,10 @@ def test_what_one_stage_judged_makes_that_stage_old_and_no_other(tmp_path, chang
     before = identity_of(config, VERSION, SERIAL)
     change(tmp_path)
     config = load_daemon_config(path)
-    why = commissioning_of(config, read_settings(config.robot), NOW).cap.sentence
-    assert f"`{key}` changed since stage {stage} s" in why
-    assert f"`--stages {stage}`" in why
+    cap = commissioning_of(config, read_settings(config.robot), NOW).cap
+    assert f"`{key}` changed since stage {' and '.join(f'{stage} s' for stage in stages)} of" in cap.why
+    cure = f"run `shearloop commission CONFIG --out FILE --stages {stages}`"
+    assert cap.cure == cure, "one cure, which names every stage"
     assert identity_of(config, VERSION, SERIAL) == before, "the other stages count"
 
 

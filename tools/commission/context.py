@@ -8,6 +8,7 @@ from typing import Final
 from shearloop.daemon.commissioning import Report
 from shearloop.daemon.config import DaemonConfig
 from shearloop.drivers.ur.control_box import ControllerInfo
+from shearloop.drivers.ur.recovery import ENDS_ITSELF_S
 from shearloop.drivers.ur.rtde import registers_in_use
 from shearloop.drivers.ur.script import UPPER, ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
@@ -20,7 +21,7 @@ from shearloop.tools.commission.mover import Mover
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.rig import Rig
-from shearloop.tools.robot_use import other_programs, registers_in_words
+from shearloop.tools.robot_use import other_programs, program_in_words, registers_in_words
 
 # With fewer stops of each layer a report raises no speed.
 STOPS_NEEDED: Final = 5
@@ -109,7 +110,12 @@ class Context:
         seen = self.rig.controller()
         if seen.registers is None:
             raise registers_in_use(self.settings.host)
-        for sign in other_programs(seen, self.rig.outputs(self.registers)):
+        outputs = self.rig.outputs(self.registers)
+        if program_in_words(outputs):
+            # The last commissioning's may end by its watchdog.
+            self.clock.sleep(ENDS_ITSELF_S)
+            outputs = self.rig.outputs(self.registers)
+        for sign in other_programs(seen, outputs):
             if sign not in self._accepted:
                 self.operator.accept(f"{sign} The commissioning replaces such a program, and moves robot and gripper.")
                 # A program is replaced; a client keeps its registers.
@@ -118,9 +124,8 @@ class Context:
     def _another_plays(self) -> bool:
         """Return whether a program plays whose clock, in the registers that we write, stands still."""
         self.observer.forget()
-        samples = self.observer.listen(_CLOCK_S)
-        ticks = {seen.outputs.script_ticks for seen in samples}
-        return len(samples) >= _CLOCK_SAMPLES and all(seen.plays for seen in samples) and len(ticks) == 1
+        latest = [seen for seen in self.observer.listen(_CLOCK_S) if seen.plays][-_CLOCK_SAMPLES:]
+        return len(latest) == _CLOCK_SAMPLES and len({seen.outputs.script_ticks for seen in latest}) == 1
 
     @property
     def mover(self) -> Mover:

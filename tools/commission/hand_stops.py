@@ -11,7 +11,7 @@ from shearloop.drivers.ur.messages import SAFETY_EMERGENCY_STOPS, SAFETY_MODES
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
-from shearloop.tools.commission.limits import MODE_AFTER_S, RESTS_WITHIN_S
+from shearloop.tools.commission.limits import MODE_AFTER_S, REHEARSED, RESTS_WITHIN_S
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import NOTHING_TO_DO, Played
 from shearloop.tools.commission.report import judged
@@ -26,6 +26,8 @@ _CONNECTED_WITHIN_S: Final = 20.0
 INTERRUPTED_NS: Final = 500_000_000
 # The wrist turned at the stop if it had half of its speed within this time before; at each end of its way it stands.
 _TURNED_WITHIN_NS: Final = 500_000_000
+# At this fraction of the asked speed the wrist turned at it.
+_AT_SPEED: Final = 0.9
 # How often the operator is asked for a stop, if it is not seen.
 _TRIES: Final = 3
 
@@ -55,6 +57,13 @@ class HandStop:
     rad: float
     safety_mode: int
     refusal: str = ""
+
+    @property
+    def stopped_rad_per_s(self) -> float:
+        """The speed that was really stopped: the asked one within the noise, else the speed before the stop."""
+        if self.rad_per_s >= _AT_SPEED * self.asked_rad_per_s:
+            return self.asked_rad_per_s
+        return math.floor(100.0 * self.rad_per_s) / 100.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,15 +150,19 @@ def hand_speeds(passed_rad_per_s: Sequence[float], count: int) -> list[float]:
     return [passed_rad_per_s[min(number, len(passed_rad_per_s) - 1)] for number in range(count)]
 
 
-def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[list[Line], float]:
-    """Have each layer stop the wrist at speeds that all other layers passed; return the lines and the largest angle."""
+def stops_by_hand(context: Context, passed_rad_per_s: Sequence[float]) -> tuple[list[Line], float, float]:
+    """Have each layer stop the wrist at speeds that all other layers passed.
+
+    Return the lines, the largest angle, and the largest speed from which every layer has stopped the wrist.
+    """
     speeds = hand_speeds(passed_rad_per_s, context.counts.stops)
-    lines, angles_rad = zip(*(stops_of_layer(context, layer, speeds) for layer in LAYERS), strict=True)
-    return list(lines), max(angles_rad)
+    of_layers = [stops_of_layer(context, layer, speeds) for layer in LAYERS]
+    lines, angles_rad, stopped_rad_per_s = zip(*of_layers, strict=True)
+    return list(lines), max(angles_rad), min(stopped_rad_per_s)
 
 
-def stops_of_layer(context: Context, layer: Layer, speeds: Sequence[float]) -> tuple[Line, float]:
-    """Have one layer stop the wrist at each speed; return the line and the largest angle."""
+def stops_of_layer(context: Context, layer: Layer, speeds: Sequence[float]) -> tuple[Line, float, float]:
+    """Have one layer stop the wrist at each speed; return the line, the largest angle and the largest stopped speed."""
     shown = ", ".join(f"{speed:g}" for speed in speeds)
     context.operator.allow(
         f"wrist 3 turns to and fro within {LARGEST_RAD:g} rad of the pose, {len(speeds)} times until you stop it, "
@@ -164,8 +177,10 @@ def stops_of_layer(context: Context, layer: Layer, speeds: Sequence[float]) -> t
             break
         stops.append(stop)
     unseen = "" if len(stops) == len(speeds) else layer.unseen
-    line = judge_hand_stops(layer.what, stops, len(speeds), context.limits.rest_s(context.settings), unseen)
-    return line, max((stop.rad for stop in stops), default=0.0)
+    longest_s, rehearsed = context.limits.rest_s(context.settings), context.limits.rehearsed
+    line = judge_hand_stops(layer.what, stops, len(speeds), longest_s, unseen, rehearsed=rehearsed)
+    stopped_rad_per_s = max((stop.stopped_rad_per_s for stop in stops), default=0.0)
+    return line, max((stop.rad for stop in stops), default=0.0), stopped_rad_per_s
 
 
 def _stop(context: Context, layer: Layer, speed: float, which: str, then: str) -> HandStop | None:
@@ -219,8 +234,13 @@ def _hand_stop(speed: float, found: Found, mode: int, refusal: str) -> HandStop:
     return HandStop(speed, abs(before.wrist_rad_per_s), time_s, angle_rad, mode, refusal)
 
 
-def judge_hand_stops(what: str, stops: Sequence[HandStop], asked: int, longest_s: float, unseen: str = "") -> Line:
-    """Return the line on all stops of a layer: time and angle to rest, mode and recovery; `unseen` is why some lack."""
+def judge_hand_stops(
+    what: str, stops: Sequence[HandStop], asked: int, longest_s: float, unseen: str = "", *, rehearsed: bool = False
+) -> Line:
+    """Return the line on all stops of a layer: time and angle to rest, mode and recovery; `unseen` is why some lack.
+
+    `rehearsed`: times and angles are of no real deadline, and are not shown.
+    """
     limit = f"at most {longest_s:g} s, and the angle of that time at the asked speed; recovery {asked} of {asked}"
     promise = "a person, or a lost connection, stops the wrist"
     if not stops:
@@ -228,6 +248,8 @@ def judge_hand_stops(what: str, stops: Sequence[HandStop], asked: int, longest_s
     times_s = [stop.time_s for stop in stops if stop.time_s is not None]
     time = f"{min(times_s):.3f} to {max(times_s):.3f} s to rest" if times_s else "time to rest not seen"
     angle = f"up to {max(stop.rad for stop in stops):.4f} rad"
+    if rehearsed:
+        time, angle = REHEARSED, ""
     speeds = [stop.rad_per_s for stop in stops]
     modes = ", ".join(dict.fromkeys(mode_name(stop.safety_mode) for stop in stops))
     failed = [stop.refusal for stop in stops if stop.refusal]

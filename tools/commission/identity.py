@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from shearloop.daemon.commissioning import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ur.control_box import ControllerInfo, untested
-from shearloop.drivers.ur.limits import PAYLOAD_KG, tool_difference
+from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_sentence, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
-from shearloop.tools.robot_use import FREE, program_in_words, registers_in_words
+from shearloop.tools.commission.wrench import HEAVIEST_KG
+from shearloop.tools.robot_use import FREE, beyond_rated, program_in_words, registers_in_words
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
@@ -22,7 +23,6 @@ MOUNTED_QUESTION = "The mass in kg of all that is mounted at the flange, weighed
 # The wrench and the protective stops of the arm depend on its payload. This is for typed values: of those that the
 # controller reports, the daemon refuses motion at a smaller difference.
 TYPED_TOLERANCE_KG = 0.1
-_HEAVIEST_KG = 35.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class Identity:
     outputs: RtdeOutputs
     safety_checksum: str
     typed_kg: tuple[float, float] | None = None
+    # The arm's model and its rated payload, None where it is not known.
+    rated: tuple[str, float | None] = ("", None)
 
 
 def measure(context: Context) -> Measured:
@@ -46,9 +48,9 @@ def measure(context: Context) -> Measured:
     checksum = context.operator.ask(CHECKSUM_QUESTION, Played(f"the pendant shows {EMULATED_CHECKSUM}"))
     typed_kg = None
     if math.isnan(outputs.payload_kg) and context.settings.tool.payload_kg is None:
-        shown_kg = context.operator.number(SHOWN_QUESTION, 0.0, _HEAVIEST_KG)
-        typed_kg = shown_kg, context.operator.number(MOUNTED_QUESTION, 0.0, _HEAVIEST_KG)
-    found = Identity(context.controller, outputs, checksum, typed_kg)
+        shown_kg = context.operator.number(SHOWN_QUESTION, 0.0, HEAVIEST_KG)
+        typed_kg = shown_kg, context.operator.number(MOUNTED_QUESTION, 0.0, HEAVIEST_KG)
+    found = Identity(context.controller, outputs, checksum, typed_kg, context.rig.rated())
     return Measured(judge_identity(found, context.settings, context.config))
 
 
@@ -56,7 +58,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
     """Return the stage's lines: versions and modes are known, payload and tool centre point are as in the settings."""
     outputs, tool, seen = identity.outputs, settings.tool, identity.controller
     major = int(seen.version.split(".", maxsplit=1)[0])
-    slider = outputs.speed_slider
+    slowed = slowed_sentence(outputs)
     lines = [
         _polyscope(seen.version),
         judged(
@@ -69,10 +71,9 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         judged("robot mode", seen.robot_mode, "RUNNING", "ready to move", passed=seen.robot_mode == "RUNNING"),
         judged("safety mode", seen.safety_mode, "NORMAL", "ready to move", passed=seen.safety_mode == "NORMAL"),
         *_other_programs(seen, outputs),
-        judged(
-            "speed slider", f"{slider:.0%}", "100%", "the loop's gain", passed=math.isclose(slider, 1.0, abs_tol=1e-6)
-        ),
+        judged("speed slider", slowed or f"{outputs.speed_slider:.0%}", "100%", "the loop's gain", passed=not slowed),
         _payload(identity, tool.payload_kg, emulated=config.emulated),
+        *_rated(identity, tool.payload_kg),
         judged(
             "safety checksum",
             identity.safety_checksum or "not given",
@@ -127,6 +128,17 @@ def _payload(identity: Identity, wanted_kg: float | None, *, emulated: bool) -> 
     limit = f"{wanted_kg:g} ± {PAYLOAD_KG:g} kg; else the daemon refuses motion"
     differs = tool_difference(identity.outputs, InstalledTool(payload_kg=wanted_kg))
     return judged("payload", value, limit, promise, passed=not differs)
+
+
+def _rated(identity: Identity, wanted_kg: float | None) -> list[Line]:
+    """Return the line on the arm's rated payload, or none where the arm's model is not known."""
+    (model, rated_kg), typed_kg = identity.rated, identity.typed_kg or ()
+    if rated_kg is None:
+        return []
+    given = (identity.outputs.payload_kg, wanted_kg, *typed_kg)
+    beyond = next(filter(None, (beyond_rated(kg, model, rated_kg) for kg in given)), "")
+    limit = f"at most {rated_kg:g} kg, the rated payload of a {model}"
+    return [judged("rated payload", beyond or "not exceeded", limit, "the arm can hold its load", passed=not beyond)]
 
 
 def _unreported_payload(typed_kg: tuple[float, float] | None, wanted_kg: float | None, promise: str) -> Line:

@@ -33,11 +33,20 @@ class TimeLimits:
         """Return the longest delay from a command to the motion."""
         return settings.reaction_s + (self.late_s or 0.0)
 
+    @property
+    def rehearsed(self) -> bool:
+        """Whether the deadlines are so long that the arm ends its way before a layer stops it: no stop is measured."""
+        return self.late_s is not None
+
     def rest_s(self, settings: UrSettings) -> float:
         """Return the longest time to rest."""
         return PROMISED_S if self.late_s is None else settings.standstill_s + self.late_s
 
 
+# The value of a line that a rehearsal does not measure.
+REHEARSED: Final = (
+    "rehearsed: not measured, because the deadlines of emulated devices are longer than those of real ones"
+)
 REAL: Final = TimeLimits(
     least_rate=0.99,
     longest_gap_s=0.04,

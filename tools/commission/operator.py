@@ -63,6 +63,14 @@ class Operator:
         """Return the answer, without blanks around it."""
         return self.answer(self._with_hint(question, played)).strip()
 
+    def word_of(self, question: str) -> str:
+        """Return an answer that is not empty; raises UserError after some empty ones."""
+        for _ in range(_MAX_TRIES):
+            if answer := self.ask(question):
+                return answer
+            self.say("Nothing was typed.")
+        raise UserError(f"nothing was typed: {question}")
+
     def number(self, question: str, low: float, high: float, played: Played | None = None) -> float:
         """Return a number within a range; raises UserError after some other answers."""
         for _ in range(_MAX_TRIES):

@@ -6,10 +6,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning import Report, StageResult
+from shearloop.daemon.commissioning import Report, StageResult, why_not_emulated
+from shearloop.daemon.commissioning_report import old_stages
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.rig import gripper_calibration, open_settings
-from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, why_not_emulated
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensing.skin_task import check_circuit
 from shearloop.daemon.sensors import load_cell_calibration
@@ -62,6 +63,8 @@ def commission(
     the configuration. The report is written after each stage. Raises UserError if a stage cannot be measured,
     DriverError for a missing device.
     """
+    if unknown := [figure for figure in only if figure not in {stage[0] for stage in STAGES}]:
+        raise UserError(f"--stages: there is no stage {', '.join(unknown)}; there are {', '.join(STAGES)}")
     settings = open_settings(config)
     if settings is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
@@ -78,8 +81,10 @@ def commission(
         controller = devices.controller()
         if config.emulated and (reason := why_not_emulated(settings.host, controller.serial_number)):
             raise UserError(reason)
-        report = report_for(identity_of(config, controller.version, controller.serial_number), earlier, out)
-        report = _without_changed(report, config, operator)
+        begun = earlier.rig if earlier is not None else None
+        rig_identity = identity_of(config, controller.version, controller.serial_number, begun)
+        report = report_for(rig_identity, earlier, out)
+        report = _without_changed(report, config, operator, only)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)
         return _run(context, left, out, only)
 
@@ -95,12 +100,20 @@ def _open_files(config: DaemonConfig) -> None:
         check_circuit(config.skin, load_calibration(config.skin.calibration))
 
 
-def _without_changed(report: Report, config: DaemonConfig, operator: Operator) -> Report:
-    """Return the report without the stages that judged something which has changed since."""
-    hashes = judged_sha256s(config)
-    for stage in report.stages:
-        if differs := stage.changed_since(hashes):
-            operator.say(f"Stage {stage.stage} is measured again, because {' and '.join(differs)} changed.")
+def _without_changed(report: Report, config: DaemonConfig, operator: Operator, only: Sequence[str]) -> Report:
+    """Return the report without the stages that are measured again because something that they judged has changed.
+
+    A stage that `only` does not name stays, and the report counts for nothing until it is measured again.
+    """
+    for stage, differs in old_stages(report, config):
+        changed = " and ".join(differs)
+        if only and stage.stage[0] not in only:
+            operator.say(
+                f"Stage {stage.stage} judged another value of {changed}. The report raises nothing until it is "
+                f"measured again: `--stages {stage.stage[0]}`."
+            )
+        else:
+            operator.say(f"Stage {stage.stage} is measured again, because {changed} changed.")
             report = without_stage(report, stage)
     return report
 
@@ -110,7 +123,7 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
     if context.config.emulated:
         times = ", and its limits on times allow for a busy computer" if context.limits is EMULATED else ""
         operator.say(f"The report says EMULATED{times}.")
-    name = operator.ask("Your name:")
+    name = operator.word_of("Your name:")
     for stage, measure in STAGES.items():
         done = context.report.stage(stage[0])
         if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):

@@ -9,17 +9,8 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from shearloop.daemon.commissioning import (
-    MAX_AGE_DAYS,
-    NOTHING_SUPPLIED,
-    Line,
-    Report,
-    StageResult,
-    Supplied,
-    Verdict,
-    load_report,
-)
-from shearloop.daemon.rig_identity import RigIdentity
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line, Report, RigIdentity, StageResult, Supplied, Verdict
+from shearloop.daemon.commissioning_report import MAX_AGE_DAYS, load_report
 from shearloop.errors import UserError
 from shearloop.yaml_files import save_yaml
 

@@ -6,8 +6,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shearloop.daemon.commissioning import Line, Supplied
-from shearloop.daemon.control.experiment_schema import SIGNS
+from shearloop.daemon.commissioning import CAPPED_NM, Line, Supplied
+from shearloop.daemon.control.experiment_schema import SIGNS, direction_of
+from shearloop.daemon.rig_identity import source_sha256
+from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.poses import tool_axis
 from shearloop.errors import UserError
@@ -28,6 +30,12 @@ STIFFNESS_TOLERANCE: Final = 0.1
 # The torque that remains after the twists, as a fraction of the largest torque.
 LARGEST_SLIP: Final = 0.15
 REPEATS_MM: Final = 1.0
+# Of the wrench and of an estimate, which drive the loop beyond the capped torque only within it.
+SCALE_TOLERANCE: Final = 0.2
+# A lever presses one way only if the other torques are below this fraction.
+_ONE_WAY: Final = 0.3
+# The twists at which the fingertips are read too.
+_FELT: Final = 2
 _SLOWLY_RAD_PER_S: Final = 0.1
 _HELD_S: Final = 1.0
 _SETTLES_S: Final = 0.5
@@ -73,18 +81,35 @@ def measure(context: Context) -> Measured:
             (*put_between(context).commands, "spring {}"),
         ),
     )
+    way = cell.only_sign
     with ExitStack() as opened:
         tactile = _tactile(context, opened)
         lines = _grips(context, tactile) if context.config.gripper is not None else []
         sensors = Sensors(opened.enter_context(context.rig.load_cell()), cell.rate_hz, tactile)
         context.ready()
-        turned = _signs(context, sensors)
+        turned = _signs(context, sensors, way)
         held, delays_s = _twists(context, sensors)
-    lines += [*turned, *judge_twists(held, spring)]
+    scales, right = judge_scales(held, context.settings.facts.estimated_nm, way)
+    lines += [*turned, *judge_twists(held, spring, way), *scales]
     delay_s = statistics.median(delays_s)
     lines.append(Line(what="torque behind the angle", value=f"{1e3 * delay_s:.0f} ms (median)", count=len(delays_s)))
-    largest_nm = max(abs(hold.load_nm - held[0].load_nm) for hold in held)
-    return Measured(lines, Supplied() if has_failed(lines) else Supplied(torque_nm=round(largest_nm, 4)))
+    largest_nm = round(max(abs(hold.load_nm - held[0].load_nm) for hold in held), 4)
+    if has_failed(lines):
+        return Measured(lines)
+    lines.append(raised_line(largest_nm, right))
+    sources = {name: source_sha256(context.config, name) for name in right}
+    return Measured(lines, Supplied(torque_nm=largest_nm, torque_sources=sources))
+
+
+def raised_line(largest_nm: float, right: Sequence[str]) -> Line:
+    """Return the line on the torque that the report allows, and of which sources."""
+    value = f"up to {largest_nm:.3f} N·m of {' and '.join([LOAD_CELL, *right])}; any other source {CAPPED_NM:g} N·m"
+    if largest_nm <= CAPPED_NM:
+        value = (
+            f"not raised: the twists reached {largest_nm:.3f} N·m, and {CAPPED_NM:g} N·m need no report; "
+            f"a spring that is stiffer together with the pads reaches more within {TURN_RAD:g} rad"
+        )
+    return Line(what="allowed torque", value=value)
 
 
 def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
@@ -155,12 +180,13 @@ def _turn(context: Context, by_rad: float) -> None:
     context.turn_to(context.pose_rad + by_rad, _SLOWLY_RAD_PER_S)
 
 
-def _signs(context: Context, sensors: Sensors) -> list[Line]:
-    """Turn once by a positive angle; the operator says which way the tool turned."""
+def _signs(context: Context, sensors: Sensors, way: int) -> list[Line]:
+    """Turn once, the way that the load cell measures; the operator says which way the tool turned."""
     context.confirm()
-    context.operator.allow(f"wrist 3 turns the tool by +{TURN_RAD:g} rad at {_SLOWLY_RAD_PER_S:g} rad/s, and back")
+    turn_rad = (way or 1) * TURN_RAD
+    context.operator.allow(f"wrist 3 turns the tool by {turn_rad:+g} rad at {_SLOWLY_RAD_PER_S:g} rad/s, and back")
     before = _hold_and_feel(context, sensors)
-    _turn(context, TURN_RAD)
+    _turn(context, turn_rad)
     after = _hold_and_feel(context, sensors)
     said = context.operator.choose(
         "Which way did the gripper turn, seen from in front of it:",
@@ -171,20 +197,22 @@ def _signs(context: Context, sensors: Sensors) -> list[Line]:
         ),
     )
     _turn(context, 0.0)
-    return judge_signs(before, after, said, context.settings.facts.estimated_nm, emulated=context.config.emulated)
+    noise_nm = context.settings.facts.estimated_nm
+    return judge_signs(before, after, said, noise_nm, way or 1, emulated=context.config.emulated)
 
 
 def judge_signs(
-    before: Held, after: Held, said: str, wrench_noise_nm: float = 0.0, *, emulated: bool = False
+    before: Held, after: Held, said: str, wrench_noise_nm: float = 0.0, way: int = 1, *, emulated: bool = False
 ) -> list[Line]:
-    """Return the lines on a positive turn: command, wrist, load cell, wrench and estimates are positive.
+    """Return the lines on a turn: command, wrist, load cell, wrench and estimates have its sign, `way`.
 
     A wrench that is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on
     recordings of real fingertips may refuse `emulated` frames.
     """
     lines: list[Line] = []
+    wanted = _sign(way)
     found = {
-        "command": "positive" if said == "counterclockwise" else f"negative: the operator said {said!r}",
+        "command": wanted if said == direction_of(way) else f"the operator said {said!r}",
         "wrist": _sign(after.wrist_rad - before.wrist_rad),
         "load cell": _sign(after.load_nm - before.load_nm),
     }
@@ -207,9 +235,9 @@ def judge_signs(
         judged(
             f"sign of the {what}",
             value,
-            "positive, counterclockwise for an eye that faces the gripper",
+            f"{wanted}, {direction_of(way)} for an eye that faces the gripper",
             "the loop turns the right way",
-            passed=value == "positive",
+            passed=value == wanted,
         )
         for what, value in found.items()
     ]
@@ -229,7 +257,7 @@ def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]
     context.operator.allow(
         f"wrist 3 turns the tool {count} times by {TURN_RAD:g} rad either way at {_SLOWLY_RAD_PER_S:g} rad/s"
     )
-    held, delays_s = [_hold(context, sensors)], []
+    held, delays_s = [_hold_and_feel(context, sensors)], []
     for number in range(count):
         begun_ns = context.clock.now_ns()
         _turn(context, TURN_RAD if number % 2 == 0 else -TURN_RAD)
@@ -237,7 +265,8 @@ def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]
         angles = [(seen.made_ns, seen.wrist_rad) for seen in context.observer.since(begun_ns)]
         torques = [(sample.t_mid_ns, sample.torque_nm) for sample in sensors.load.since(begun_ns)]
         delays_s.append(_middle_s(torques) - _middle_s(angles))
-        held.append(_hold(context, sensors))
+        # One twist each way shows the scale of an estimate, whose frames take long.
+        held.append((_hold_and_feel if number < _FELT else _hold)(context, sensors))
     _turn(context, 0.0)
     held.append(_hold(context, sensors))
     return held, delays_s
@@ -247,26 +276,38 @@ def _middle_s(curve: Curve) -> float:
     return middle_s(curve, curve[0][1], curve[-1][1])
 
 
-def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:
-    """Return the lines on stiffness and slip; the first and the last measurements are at the pose."""
+def _of_way(held: Sequence[Held], way: int) -> list[Held]:
+    """Return the measurements at the pose and those that the load cell can read: `way` is the only sign, 0 for both."""
+    first, *others = held
+    return [first, *(hold for hold in others if way == 0 or (hold.wrist_rad - first.wrist_rad) * way > 0)]
+
+
+def judge_twists(held: Sequence[Held], spring: float, way: int = 0) -> list[Line]:
+    """Return the lines on stiffness and slip; the first and the last measurements are at the pose.
+
+    `way` is the sign of the only torques that the load cell measures, 0 for both: a lever may press one way only.
+    """
     first, *twisted, last = held
+    seen = _of_way([first, *twisted], way)[1:]
+    # From a twist to the next one, or from the pose if the load cell reads nothing at the other twists.
+    begins = [first, *seen] if way == 0 else [first] * len(seen)
     stiffnesses = [
         (after.load_nm - before.load_nm) / (after.wrist_rad - before.wrist_rad)
-        for before, after in zip([first, *twisted], twisted, strict=False)
+        for before, after in zip(begins, seen, strict=False)
     ]
     found = abs(statistics.fmean(stiffnesses))
-    largest_nm = max(abs(hold.load_nm - first.load_nm) for hold in twisted)
+    largest_nm = max(abs(hold.load_nm - first.load_nm) for hold in seen)
     # The last angle differs a little from the first, and explains a part of the torque; the rest is slip.
     expected_nm = statistics.fmean(stiffnesses) * (last.wrist_rad - first.wrist_rad)
     slip = abs(last.load_nm - first.load_nm - expected_nm) / largest_nm if largest_nm else 1.0
     return [
         judged(
             "stiffness",
-            f"{found:.3f} N·m/rad",
+            f"{found:.3f} N·m/rad{_one_way_only(first, seen) if way == 0 else ''}",
             f"{spring:g} N·m/rad ± {STIFFNESS_TOLERANCE:.0%}",
             "torque and angle fit together",
             passed=abs(found / spring - 1.0) <= STIFFNESS_TOLERANCE,
-            count=len(twisted),
+            count=len(seen),
         ),
         judged(
             "slip in the grip",
@@ -274,6 +315,57 @@ def judge_twists(held: Sequence[Held], spring: float) -> list[Line]:
             f"at most {LARGEST_SLIP:.0%}",
             "the grip holds this torque",
             passed=slip <= LARGEST_SLIP,
-            count=len(twisted),
+            count=len(seen),
         ),
     ]
+
+
+def _one_way_only(first: Held, twisted: Sequence[Held]) -> str:
+    """Return that the load cell shows the twists of one direction alone, with the cure, or an empty string."""
+    largest_nm = {
+        way: max((abs(hold.load_nm - first.load_nm) for hold in _of_way([first, *twisted], way)[1:]), default=None)
+        for way in (1, -1)
+    }
+    up_nm, down_nm = largest_nm[1], largest_nm[-1]
+    if up_nm is None or down_nm is None or min(up_nm, down_nm) > _ONE_WAY * max(up_nm, down_nm):
+        return ""
+    direction = direction_of(1 if up_nm > down_nm else -1)
+    return (
+        f"; the load cell shows twists {direction} alone: if its lever presses one way only, write "
+        f"`load_cell.direction: {direction}` into the configuration"
+    )
+
+
+def judge_scales(held: Sequence[Held], wrench_noise_nm: float = 0.0, way: int = 0) -> tuple[list[Line], list[str]]:
+    """Return the lines on the scale of the wrench and of each estimate, and the sources whose scale is right.
+
+    The scale is the slope over the load cell's torque. A wrong one fails nothing: the source's torques stay capped.
+    """
+    seen, lines, right = _of_way(held[:-1], way), [], []
+    pairs: dict[str, list[tuple[float, float]]] = {}
+    if not wrench_noise_nm:
+        pairs[WRENCH] = [(hold.load_nm, hold.wrench_nm) for hold in seen]
+    for name in held[0].tactile_nm:
+        felt = [(hold.load_nm, hold.tactile_nm.get(name)) for hold in seen if name in hold.tactile_nm]
+        pairs[name] = [(load_nm, nm) for load_nm, nm in felt if nm is not None]
+    for name, torques_nm in pairs.items():
+        scale = _slope(torques_nm)
+        passed = scale is not None and abs(scale - 1.0) <= SCALE_TOLERANCE
+        right += [name] if passed else []
+        lines.append(
+            Line(
+                what=f"scale of {name}",
+                value="no estimate in the grip" if scale is None else f"{scale:.2f} of the load cell's",
+                limit=f"1 ± {SCALE_TOLERANCE:g}; else the torque that it drives stays capped at {CAPPED_NM:g} N·m",
+                count=len(torques_nm),
+                verdict="passed" if passed else "noted",
+            )
+        )
+    return lines, right
+
+
+def _slope(points: Sequence[tuple[float, float]]) -> float | None:
+    """Return the slope of a line through points, or None where they have one abscissa."""
+    if len({x for x, _ in points}) < 2:
+        return None
+    return statistics.linear_regression(*zip(*points, strict=True)).slope

@@ -22,6 +22,10 @@ STAGE: Final = "5 wrench"
 SIGMAS: Final = 5.0
 MASS_TOLERANCE: Final = 0.1
 LARGEST_KG: Final = 5.0
+# The rated payload of a UR3.
+_SMALLEST_ARM_KG: Final = 3.0
+# Of all arms.
+HEAVIEST_KG: Final = 35.0
 _READ_S: Final = 2.0
 
 
@@ -58,7 +62,7 @@ def measure(context: Context) -> Measured:
     readings = [_after_start(context) for _ in range(context.counts.starts)]
     readings += _at_poses(context)
     lines = judge_rest(readings, context.settings)
-    return Measured([*lines, _hung_mass(context)])
+    return Measured([*lines, hung_mass(context)])
 
 
 def _after_start(context: Context) -> Reading:
@@ -137,16 +141,52 @@ def judge_rest(readings: Sequence[Reading], settings: UrSettings) -> list[Line]:
     return lines
 
 
-def _hung_mass(context: Context) -> Line:
-    before, least_kg = read(context), least_mass_kg(context.settings)
+def hung_mass(context: Context) -> Line:
+    """Return the line on a mass that the operator hangs on the tool, if one may hang that shows."""
+    settings, least_kg = context.settings, least_mass_kg(context.settings)
+    payload_kg = settings.tool.payload_kg
+    if payload_kg is None:
+        payload_kg = context.observer.latest().outputs.payload_kg
+    if math.isnan(payload_kg):
+        payload_kg = context.operator.number("The payload in kg that is set at the pendant", 0.0, HEAVIEST_KG)
+    model, rated_kg = context.rig.rated()
+    if rated_kg is None and context.config.emulated:
+        model, rated_kg = "emulated arm", HEAVIEST_KG
+    largest_kg, because = largest_mass_kg(settings, payload_kg, model, rated_kg)
+    if largest_kg < least_kg:
+        value = (
+            f"not measured: the wrench shows masses from {least_kg:g} kg on, and at most {largest_kg:g} kg may hang: "
+            f"{because}. The scale of the wrench's force stays unmeasured"
+        )
+        return Line(what="hung mass", value=value)
+    before = read(context)
     kg = context.operator.number(
-        "Hang a known mass on the tool and let it rest; its mass in kg",
-        *(least_kg, LARGEST_KG),
-        Played(f"the mass that you type is hung for you, for instance {math.ceil(least_kg):g}", ("robot hang {}",)),
+        f"Hang a known mass on the tool and let it rest ({because}); its mass in kg",
+        *(least_kg, largest_kg),
+        Played(f"the mass that you type is hung for you, for instance {least_kg:g}", ("robot hang {}",)),
     )
     after = read(context)
     context.operator.act("Take the mass off", Played("it is taken off for you", ("robot hang 0",)))
-    return judge_mass(before, after, kg, context.settings)
+    return judge_mass(before, after, kg, settings)
+
+
+def largest_mass_kg(
+    settings: UrSettings, payload_kg: float, model: str = "", rated_kg: float | None = None
+) -> tuple[float, str]:
+    """Return the largest mass that may hang on the tool beside its payload, and what limits it.
+
+    An arm of an unknown model counts as the smallest one. The weight stays below the limit at which the arm stops.
+    """
+    arm = f"this {model} is rated for" if rated_kg is not None else "an arm of unknown model may be rated for"
+    rated_kg = _SMALLEST_ARM_KG if rated_kg is None else rated_kg
+    stops_n = settings.limits.force_n.hard
+    bounds = [
+        (LARGEST_KG, f"at most {LARGEST_KG:g} kg is needed"),
+        (rated_kg - payload_kg, f"{arm} {rated_kg:g} kg, and its payload is {payload_kg:g} kg"),
+        ((stops_n - settings.facts.noise_n) / constants.g, f"limits.force_n.hard stops the arm at {stops_n:g} N"),
+    ]
+    largest_kg, because = min(bounds)
+    return max(0.0, math.floor(10.0 * largest_kg + 1e-9) / 10.0), because
 
 
 def least_mass_kg(settings: UrSettings) -> float:

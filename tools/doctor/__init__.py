@@ -13,7 +13,7 @@ from typing import NamedTuple, Self
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
-from shearloop.daemon.commissioning import commissioning_of
+from shearloop.daemon.commissioned import commissioning_of
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
 from shearloop.daemon.rig import configured_settings
 from shearloop.daemon.running_rig import EMULATED

@@ -11,22 +11,24 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.commissioning import commissioning_of
+from shearloop.daemon.commissioned import commissioning_of
+from shearloop.daemon.commissioning import why_not_emulated
 from shearloop.daemon.config import DaemonConfig, GripperConfig, SkinConfig
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.rig import make_gripper_client
-from shearloop.daemon.rig_identity import why_not_emulated
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensing.skin_task import current_source, voltage_reader
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.shear_skin.instruments import PolledInstrument
-from shearloop.drivers.ur.control_box import check_generation, check_ports, query_controller, untested
+from shearloop.drivers.ur.control_box import ControllerInfo, check_generation, check_ports, query_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
+from shearloop.drivers.ur.limits import slowed_sentence, tool_difference
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.primary_port import PrimaryPort
+from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.tools.doctor.boards import (
@@ -39,7 +41,7 @@ from shearloop.tools.doctor.boards import (
     table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
-from shearloop.tools.robot_use import FREE, registers_in_words
+from shearloop.tools.robot_use import FREE, beyond_rated, read_outputs, read_rated_kg, registers_in_words
 from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
@@ -143,6 +145,7 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
     else:
         cure = "make the cell safe, start the daemon, then send `shearloop command unlock`"
         yield note("robot's mode", mode, "the arm does not move in this mode", cure)
+    yield from _check_setting(settings, seen)
     registers = registers_in_words(seen)
     if registers == FREE:
         yield good("robot's registers", registers)
@@ -153,6 +156,37 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
         cure = "close the other program, or disable the adapter under Installation → Fieldbus"
         yield trouble("robot's registers", "in use", means, cure)
+
+
+def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Finding]:
+    """Judge slider, payload and tool at the pendant, as the daemon does before each motion."""
+    host, means = settings.host, "the daemon refuses every motion"
+    try:
+        outputs = read_outputs(host, ROBOT_TIMEOUT_S, seen.registers or UPPER)
+        model, rated_kg = read_rated_kg(host, ROBOT_TIMEOUT_S, settings.facts.major)
+    except DriverError as error:
+        cure = "look at the teach pendant, and run the doctor again"
+        yield from_error("robot's state", error, "slider, payload and tool are not known", cure)
+        return
+    slowed, differs = slowed_sentence(outputs), tool_difference(outputs, settings.tool)
+    if slowed:
+        what, _, cure = slowed.partition(": ")
+        yield trouble("speed slider", what, means, cure.rstrip("."))
+    else:
+        yield good("speed slider", f"{outputs.speed_slider:.0%}")
+    for payload_kg in (outputs.payload_kg, settings.tool.payload_kg):
+        if not differs and (beyond := beyond_rated(payload_kg, model, rated_kg)):
+            cure = "mount less, and correct `tool.payload_kg` and the pendant"
+            yield trouble("payload", beyond, "the arm cannot hold it safely", cure)
+            return
+    if differs:
+        what, _, cure = differs.partition(": ")
+        yield trouble("payload and tool", what, means, cure.rstrip("."))
+    elif settings.tool.absent and settings.tool.reported:
+        # The findings on the robot's settings name what is absent.
+        return
+    else:
+        yield good("payload and tool", "as in the robot's settings")
 
 
 def check_identity(config: DaemonConfig, settings: UrSettings, version: str, serial_number: str) -> Iterator[Finding]:

@@ -442,6 +442,9 @@ class SimulatedRig:
             tcp_offset=robot.spec.tcp_offset,
         )
 
+    def rated(self) -> tuple[str, float | None]:
+        return "UR5", 5.0
+
     def write_register(self, _registers: ScriptRegisters, value: int) -> int:
         return value
 

@@ -15,11 +15,10 @@ import pytest
 import yaml
 
 from shearloop.cli import main, other_daemon
-from shearloop.daemon.commissioning import Line, Report, StageResult
+from shearloop.daemon.commissioning import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
-from shearloop.daemon.rig_identity import RigIdentity
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.limits import tool_difference
@@ -57,7 +56,9 @@ def seen(**changed: object) -> Identity:
 def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
     write_filled_in(folder, host=host, tool={**TOOL, "payload_kg": 1.4, "tcp_offset": [0.0] * 6})
     path = folder / "rig.yaml"
-    path.write_text(yaml.safe_dump({"load_cell": {"device": {"serial_number": "7583"}}, "robot": "ur.yaml"}))
+    addresses = {key: f"ipc://{folder}/{key}" for key in ("publish", "commands")}
+    cell = {"device": {"serial_number": "7583"}}
+    path.write_text(yaml.safe_dump({"load_cell": cell, "robot": "ur.yaml", **addresses}))
     return path
 
 
@@ -72,6 +73,8 @@ def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
         (seen(registers=None), ["registers"]),
         (replace(GOOD, safety_checksum=""), ["safety checksum"]),
         (replace(GOOD, outputs=replace(OUTPUTS, speed_slider=0.5)), ["speed slider"]),
+        (replace(GOOD, rated=("UR5", 5.0)), []),
+        (replace(GOOD, rated=("UR1", 1.0)), ["rated payload"]),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.409)), []),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.42)), ["payload"]),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=math.nan)), ["payload"]),
@@ -123,7 +126,7 @@ def stage_0(tmp_path: Path, answers: list[str], version: str, tool: InstalledToo
         asked.append(question)
         return answers.pop(0)
 
-    rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed))
+    rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed), rated=lambda: ("", None))
     settings, controller = replace(read_settings(config.robot), tool=tool), replace(CONTROLLER, version=version)
     operator = Operator(answer, lambda _: None, allows=True)
     measured = identity.measure(Context(config, settings, rig, controller, operator, None, Counts(), ExitStack()))

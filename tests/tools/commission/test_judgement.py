@@ -19,15 +19,16 @@ from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.robotiq.width_fit import fit_width
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 from shearloop.drivers.ur.messages import RtdeOutputs
+from shearloop.drivers.ur.settings import ForceBound, InstalledTool
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.estimation.skin.calibration import load_calibration
-from shearloop.tools.commission import boards, tool
+from shearloop.tools.commission import boards, tool, wrench
 from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
 from shearloop.tools.commission.curves import middle_s, step_s
 from shearloop.tools.commission.gripper import judge_widths
 from shearloop.tools.commission.hand_stops import HandStop, hand_speeds, judge_hand_stops
-from shearloop.tools.commission.limits import EMULATED, REAL
+from shearloop.tools.commission.limits import EMULATED, REAL, REHEARSED
 from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
@@ -41,9 +42,16 @@ from shearloop.tools.commission.tap import (
     skin_step_s,
     why_hidden,
 )
-from shearloop.tools.commission.tool import Held, judge_signs, judge_twists
+from shearloop.tools.commission.tool import Held, judge_scales, judge_signs, judge_twists, raised_line
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
-from shearloop.tools.commission.wrench import LARGEST_KG, Reading, judge_mass, judge_rest, least_mass_kg
+from shearloop.tools.commission.wrench import (
+    LARGEST_KG,
+    Reading,
+    judge_mass,
+    judge_rest,
+    largest_mass_kg,
+    least_mass_kg,
+)
 from tests.drivers.ur.robots import DELIVERED
 from tests.emulators.test_cb3 import SETTINGS as CB3
 
@@ -145,6 +153,22 @@ def test_one_bad_stop_fails_its_line(stop, lines):
     assert failed(judge_stops([GOOD, stop], "at 0.2 rad/s", "rad", REAL.rest_s(DELIVERED))) == lines
 
 
+def test_a_rehearsed_stop_is_no_measurement():
+    """The arm turned on to the end of its way: nothing of its times and ways is of a layer."""
+    slow = dataclasses.replace(GOOD, time_s=1.088, way=0.1964)
+    lines = judge_stops([slow], "at 0.2 rad/s", "rad", EMULATED.rest_s(DELIVERED), rehearsed=True)
+    timed = [line for line in lines if "time to rest" in line.what or "worker killed" in line.what]
+    assert [(line.verdict, line.value) for line in timed] == [("noted", REHEARSED)] * 2
+    line = judge_hand_stops("emergency stop", [HAND], 1, 3.0, rehearsed=True)
+    assert REHEARSED in line.value
+    assert "0.0200 rad" not in line.value
+
+
+@pytest.mark.parametrize(("rad_per_s", "stopped"), [(0.47, 0.5), (0.449, 0.44), (0.29, 0.29), (0.03, 0.03)])
+def test_a_stop_by_hand_counts_for_the_speed_that_it_stopped(rad_per_s, stopped):
+    assert dataclasses.replace(HAND, rad_per_s=rad_per_s).stopped_rad_per_s == pytest.approx(stopped, abs=0.01)
+
+
 HAND = HandStop(0.5, 0.47, 0.05, 0.02, 1)
 
 
@@ -206,6 +230,31 @@ def test_a_wrench_without_a_load_fails_its_line(reading, lines):
 def test_a_hung_mass_is_weighed(force_n, lines):
     after = dataclasses.replace(READING, mean=(0.0, 0.0, force_n, 0.0, 0.0, 0.0))
     assert failed([judge_mass(READING, after, 2.0, DELIVERED)]) == lines
+
+
+def test_a_mass_that_is_hung_is_bounded_by_the_arm_and_by_the_limit_that_stops_it():
+    careful = dataclasses.replace(DELIVERED.limits, force_n=ForceBound(20.0, 30.0))
+    largest_kg, because = largest_mass_kg(dataclasses.replace(DELIVERED, limits=careful), 1.0, "UR5", 5.0)
+    assert largest_kg == pytest.approx((30.0 - 3.5) / 9.81, abs=0.1)
+    assert "limits.force_n.hard stops the arm at 30 N" in because
+    assert largest_mass_kg(DELIVERED, 4.5, "UR5", 5.0) == (0.5, "this UR5 is rated for 5 kg, and its payload is 4.5 kg")
+    wide = dataclasses.replace(CB3.limits, force_n=ForceBound(120.0, 150.0))
+    settings = dataclasses.replace(CB3, limits=wide)
+    assert largest_mass_kg(settings, 1.0, "UR10", 10.0)[0] == LARGEST_KG
+    assert largest_mass_kg(settings, 1.0, "UR3", 3.0)[0] == 2.0, "less than a CB3 shows"
+    assert largest_mass_kg(settings, 2.5)[0] == 0.5, "an unknown arm may be the smallest one"
+    assert largest_mass_kg(settings, 4.0, "UR3", 3.0)[0] == 0.0
+
+
+def test_a_stage_without_a_mass_that_may_hang_says_what_stays_unmeasured():
+    context: Any = SimpleNamespace(
+        settings=dataclasses.replace(CB3, tool=InstalledTool(payload_kg=1.25)),
+        config=SimpleNamespace(emulated=False),
+        rig=SimpleNamespace(rated=lambda: ("UR3", 3.0)),
+    )
+    line = wrench.hung_mass(context)
+    assert (line.verdict, "at most 1.7 kg may hang" in line.value) == ("noted", True)
+    assert "The scale of the wrench's force stays unmeasured" in line.value
 
 
 @pytest.mark.parametrize("settings", [DELIVERED, CB3], ids=["e-series", "cb3"])
@@ -309,6 +358,45 @@ def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
 )
 def test_a_wrong_spring_and_a_slipping_grip_fail_their_lines(turned, lines):
     assert failed(judge_twists(turned, 0.8)) == lines
+
+
+def one_way(direction: int) -> list[Held]:
+    """Return the measurements of a load cell whose lever presses one way only, on a spring of 0.8 N·m/rad."""
+    return [dataclasses.replace(one, load_nm=max(0.0, one.load_nm * direction) * direction) for one in held(0.8)]
+
+
+@pytest.mark.parametrize(("way", "direction"), [(1, "counterclockwise"), (-1, "clockwise")])
+def test_a_lever_that_presses_one_way_is_judged_in_that_direction(way, direction):
+    assert failed(judge_twists(one_way(way), 0.8, way)) == []
+    unknown = judge_twists(one_way(way), 0.8)
+    assert failed(unknown) == ["stiffness"], "it would show half of the stiffness"
+    assert f"write `load_cell.direction: {direction}`" in unknown[0].value
+    assert "load_cell.direction" not in judge_twists(held(0.8), 0.8)[0].value
+
+
+def test_a_turn_that_a_one_way_load_cell_measures_may_be_clockwise():
+    before, after = Held(0.0, 0.0, 0.0), Held(-0.08, -0.05, -0.05)
+    assert failed(judge_signs(before, after, "clockwise", 0.0, -1)) == []
+    assert failed(judge_signs(before, after, "counterclockwise", 0.0, -1)) == ["sign of the command"]
+
+
+def felt(scale: float | None) -> list[Held]:
+    """Return the measurements of a fingertip with this scale at the first twists, and of a right wrench."""
+    found = [dataclasses.replace(one, wrench_nm=one.load_nm) for one in held(0.8)]
+    tactile = [{"right": None if scale is None else scale * one.load_nm + 0.01} for one in found[:3]]
+    return [*(dataclasses.replace(one, tactile_nm=own) for one, own in zip(found, tactile, strict=False)), *found[3:]]
+
+
+@pytest.mark.parametrize(("scale", "right"), [(1.1, ["wrench", "right"]), (1.4, ["wrench"]), (None, ["wrench"])])
+def test_the_sources_with_the_right_scale_are_named_and_a_wrong_one_fails_nothing(scale, right):
+    lines, found = judge_scales(felt(scale))
+    assert (found, failed(lines)) == (right, [])
+    assert judge_scales(felt(1.0), wrench_noise_nm=5.0)[1] == ["right"], "the wrench of a CB3 is an estimate"
+
+
+def test_the_stage_says_which_torque_is_raised_and_of_what():
+    assert "up to 0.540 N·m of load_cell and right; any other source 0.3 N·m" in raised_line(0.54, ["right"]).value
+    assert "not raised: the twists reached 0.064 N·m" in raised_line(0.064, []).value
 
 
 @pytest.mark.parametrize("period_s", [0.008, 0.09, 0.3])

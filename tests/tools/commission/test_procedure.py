@@ -11,12 +11,14 @@ import yaml
 
 from benchmarks.stop_times import write_random_bank
 from shearloop.bank.bank_file import Bank
-from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line, commissioning_of
+from shearloop.daemon.commissioned import commissioning_of
+from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.hand_stops import LAYERS, stops_of_layer
+from shearloop.tools.commission.limits import REHEARSED
 from shearloop.tools.commission.mover_process import CAUSES
 from shearloop.tools.commission.operator import DeclinedError
 from shearloop.tools.commission.procedure import STAGES, commission
@@ -108,7 +110,7 @@ class Lab:
         with ExitStack() as opened:
             settings, controller, operator = open_settings(config), self.rig.controller(), self.operator.operator
             context = Context(config, settings, self.rig, controller, operator, None, COUNTS, opened)
-            line, _ = stops_of_layer(context, layer, (0.2,))
+            line, *_ = stops_of_layer(context, layer, (0.2,))
         return line
 
     def run(self, only: str = "", counts: Counts = COUNTS):
@@ -162,6 +164,10 @@ def test_an_emulated_rig_with_its_long_deadlines_passes_and_says_so(emulated_lab
     assert report.rig.emulated
     assert "EMULATED" in page.read_text()
     assert "limits on times" in emulated_lab.operator.said[0]
+    lines = {line.what: line for line in report.stages[0].lines}
+    for what in ("time to rest at 0.2 rad/s", "worker killed at 0.2 rad/s", "watchdog alone, at rest"):
+        assert (lines[what].verdict, lines[what].value) == ("noted", REHEARSED)
+    assert report.supplied().stop_rad is None
 
 
 FAULTS = [

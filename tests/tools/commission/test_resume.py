@@ -7,11 +7,13 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from shearloop.daemon.commissioning import Line, Verdict, load_report
+from shearloop.daemon.commissioning import Line, Verdict
+from shearloop.daemon.commissioning_report import load_report
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.script import LOWER, UPPER
+from shearloop.errors import UserError
 from shearloop.tools.commission import procedure
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.operator import WORD, DeclinedError, Operator
@@ -22,6 +24,7 @@ CONTROLLER = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, r
 
 
 RIG = SimpleNamespace(controller=lambda: CONTROLLER, outputs=lambda _: OUTPUTS)
+NO_CLOCK = SimpleNamespace(sleep=lambda _: None)
 
 
 def play_stages(monkeypatch: pytest.MonkeyPatch, verdicts: Mapping[str, Verdict]) -> list[str]:
@@ -102,7 +105,7 @@ def test_another_program_on_the_robot_is_named_before_each_stage_that_moves(
     ran = play_stages(monkeypatch, dict.fromkeys(("0 identity", "1 b", "2 c"), "passed"))
     path, out, asked = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
     controller, outputs = replace(CONTROLLER, registers=registers), replace(OUTPUTS, runtime_state=runtime_state)
-    rig = SimpleNamespace(controller=lambda: controller, outputs=lambda _: outputs)
+    rig = SimpleNamespace(controller=lambda: controller, outputs=lambda _: outputs, clock=NO_CLOCK)
 
     def run(word: str) -> None:
         def answer(question: str) -> str:
@@ -136,3 +139,38 @@ def test_a_robot_whose_registers_are_all_taken_is_not_moved_by_a_later_run(tmp_p
     with pytest.raises(RobotLostError, match="already in use"):
         run("3", taken)
     assert ran == ["0 identity"]
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_stage_that_is_not_named_is_kept_and_said_to_be_old(tmp_path, monkeypatch):
+    """Its torque would be lost without a word."""
+    ran = play_stages(monkeypatch, dict.fromkeys(("0 identity", "3 b", "4 c"), "passed"))
+    path, out, said = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
+
+    def run(only: str = "") -> None:
+        operator = Operator(lambda _: WORD, said.append, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
+
+    run()
+    settings = yaml.safe_load((tmp_path / "ur.yaml").read_text())
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**settings, "rest_rad_per_s": 0.02}))
+    ran.clear()
+    run("3")
+    assert ran == ["3 b"]
+    assert [one.stage for one in load_report(out).stages] == ["0 identity", "3 b", "4 c"]
+    assert any("Stage 4 c judged another value of `rest_rad_per_s`" in line and "`--stages 4`" in line for line in said)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_stage_that_does_not_exist_and_an_empty_name_are_refused(tmp_path):
+    path, out = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml"
+
+    def run(only: str, answer: str) -> None:
+        operator = Operator(lambda _: answer, lambda _: None, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
+
+    with pytest.raises(UserError, match="there is no stage 9"):
+        run("9", WORD)
+    with pytest.raises(UserError, match="nothing was typed: Your name"):
+        run("", "")
+    assert not out.exists()

@@ -13,7 +13,8 @@ import pytest
 import yaml
 
 from shearloop.cli.rehearsal import rehearsal, sentences_of_run
-from shearloop.daemon.commissioning import CAPPED_NM, CAPPED_RAD_PER_S, commissioning_of
+from shearloop.daemon.commissioned import commissioning_of
+from shearloop.daemon.commissioning import CAPPED_NM, CAPPED_RAD_PER_S
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.experiment_files import check_experiment
 from shearloop.daemon.rig import open_settings

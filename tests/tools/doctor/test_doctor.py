@@ -111,6 +111,17 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_
         # The board sends more often than the configuration says.
         assert found["rate of load_cell"].state == "note"
         assert "5 Hz configured" in found["rate of load_cell"].found
+        assert (found["speed slider"].state, found["payload and tool"].state) == ("good", "good")
+        rig.stdin.write(b"slider 0.5\npayload 2\n")
+        assert b"obeyed" in await rig.stdout.readline()
+        assert b"obeyed" in await rig.stdout.readline()
+        found = await examined(rig_config, 0.1)
+        assert (found["speed slider"].state, found["payload and tool"].state) == ("trouble", "trouble")
+        assert "The speed slider is at 50 %" in found["speed slider"].found
+        assert "the daemon refuses every motion" in found["payload and tool"].means
+        rig.stdin.write(b"slider 1\npayload 1\n")
+        assert b"obeyed" in await rig.stdout.readline()
+        assert b"obeyed" in await rig.stdout.readline()
         rig.stdin.write(b"registers-in-use\nlocal-control\n")
         assert b"obeyed" in await rig.stdout.readline()
         assert b"obeyed" in await rig.stdout.readline()

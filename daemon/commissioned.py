@@ -1,0 +1,33 @@
+"""What the configured report of a rig's commissioning allows; a rig without a report loads nothing of reports."""
+
+from datetime import UTC, datetime
+
+from shearloop.daemon.commissioning import Commissioning
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.torques import LOAD_CELL
+from shearloop.drivers.ur.settings import UrSettings
+
+
+def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime | None = None) -> Commissioning:
+    """Return what a rig's report allows at a time, by default now.
+
+    A rehearsal has the cap of the rig that it plays, and a report of emulated devices raises this cap too. Raises
+    UserError for a file that cannot be read or is no report, which is a mistake in the configuration.
+    """
+    rehearsed = config.real is not config
+    if config.emulated and not rehearsed:
+        return Commissioning(settings, None, emulated=True)
+    if config.commissioned is None:
+        return Commissioning(settings, None, "`commissioned` is not in the configuration", rehearsed=rehearsed)
+    from shearloop.daemon.commissioning_report import load_report, old_stages, why_not
+    from shearloop.daemon.rig_identity import source_sha256
+
+    report = load_report(config.commissioned)
+    reason = why_not(report, config, now or datetime.now(UTC))
+    measured = {} if reason else report.supplied().torque_sources or {}
+    # After another calibration nobody knows sign and scale.
+    same = (name for name, own in sorted(measured.items()) if source_sha256(config, name) == own)
+    old = "".join(stage.stage[0] for stage, _ in old_stages(report, config)) if reason else ""
+    return Commissioning(
+        settings, report, reason, rehearsed=rehearsed, torque_sources=(LOAD_CELL, *same), old_stages=old
+    )

@@ -235,7 +235,7 @@ class RunningRig:
         end_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < end_s:
             path.write_text(yaml.safe_dump({**content, "steps": steps()}))
-            reply = self.send("start", experiment=str(path))
+            reply = self.send("start", experiment=str(path), confirmed=True)
             if reply["ok"] and "wrist_rad" in (reply := dict(self.wait_for(condition))):
                 return
             # Devices come back at their own time.

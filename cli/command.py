@@ -25,7 +25,7 @@ DAEMON_COMMANDS = {
     "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
     "status": "show the experiment and the state of each task",
     "experiments": "list the experiments that `start` may name",
-    "start": "start an experiment",
+    "start": "start an experiment; --yes where it lets a held tool go",
     "pause": "hold the arm until `resume`; moving fingers finish their move",
     "resume": "continue after `pause`",
     "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
@@ -38,7 +38,7 @@ _ACTS_ON_NOTHING_SHOWN = ("stop", *addresses.READ_ONLY)
 OPTIONS = {
     "source": ("--source", ("tare",)),
     "experiment": ("--experiment", ("start",)),
-    "confirmed": ("--yes", ("tare", "unlock", "release")),
+    "confirmed": ("--yes", ("tare", "start", "unlock", "release")),
 }
 # Their replies are shown as tables.
 _TABLES = ("status", "experiments")
@@ -66,7 +66,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("name", choices=DAEMON_COMMANDS, metavar="COMMAND", help="one of the commands below")
     parser.add_argument("--source", metavar="NAME", help="for tare: name of the sensor (default: all)")
     add_option(parser, "--experiment", Path, "FILE", "for start (default: that of the configuration)")
-    yes = "for release and unlock: the tool may drop, or is another one; for tare: nothing is held"
+    yes = "for start, release and unlock: the tool may drop, or is another one; for tare: nothing is held"
     parser.add_argument("--yes", action="store_true", help=yes)
     add_connection(parser, addresses.COMMAND_ADDRESS, "the daemon's command address")
     default = f"{addresses.COMMAND_TIMEOUT_S:g} s, for {', '.join(addresses.SLOW)} {addresses.UNLOCK_TIMEOUT_S:g} s"

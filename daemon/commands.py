@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 # The arguments of each command that acts, with their types.
 ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "tare": {"source": str, "confirmed": bool},
-    "start": {"experiment": str, "ask": bool, "digest": str},
+    "start": {"experiment": str, "confirmed": bool, "ask": bool, "digest": str},
     "unlock": {"confirmed": bool, "digest": str, "stop": int},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
@@ -183,7 +183,8 @@ class Commands:
             if request.get("ask"):
                 question = await rig.start_question(Path(path))
                 return dict(question.facts)
-            _refuse_if(await rig.start(Path(path), request.get("digest"), self._deadline(request)))
+            digest, confirmed = request.get("digest"), bool(request.get("confirmed"))
+            _refuse_if(await rig.start(Path(path), digest, self._deadline(request), confirmed=confirmed))
         except QuestionChangedError as error:
             raise CommandRefusedError(str(error), **error.question.facts) from error
         except InvalidExperimentError as error:

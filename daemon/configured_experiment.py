@@ -42,7 +42,8 @@ class ConfiguredExperiment:
     async def _start_once(self) -> None:
         log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""
         while self._awaited:
-            reason = await self._rig.start(self.path)
+            # It starts by itself on emulated rigs alone.
+            reason = await self._rig.start(self.path, confirmed=True)
             if reason is None:
                 self.on_begun(self.path)
             else:

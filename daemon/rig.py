@@ -23,7 +23,7 @@ from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
-from shearloop.daemon.questions import Question, QuestionChangedError, digest_of
+from shearloop.daemon.questions import Question, QuestionChangedError
 from shearloop.daemon.rig_memory import NoMemory, RigMemory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
@@ -248,9 +248,12 @@ class Rig:
     def _start_under_way(self) -> str | None:
         return f"{self.starting} is being started; wait until it has begun, or stop it" if self.starting else None
 
-    async def start(self, path: Path, digest: str | None = None, deadline: Deadline = NO_DEADLINE) -> str | None:
+    async def start(
+        self, path: Path, digest: str | None = None, deadline: Deadline = NO_DEADLINE, *, confirmed: bool = False
+    ) -> str | None:
         """Begin and record the experiment of a file; return None, or why not. Raises UserError for an invalid file.
 
+        `confirmed`: a person says that the tool may drop that the gripper holds, or may hold, where a step opens it.
         `digest` is of the question that a person has confirmed, if one was asked; raises QuestionChangedError where
         another one would be asked now. `deadline` is checked after each wait: a slow drive makes the request too old.
         """
@@ -259,11 +262,11 @@ class Rig:
             return reason
         self.starting = path.name
         try:
-            return await self._start(path, digest, deadline)
+            return await self._start(path, digest, deadline, confirmed=confirmed)
         finally:
             self.starting = ""
 
-    async def _start(self, path: Path, digest: str | None, deadline: Deadline) -> str | None:
+    async def _start(self, path: Path, digest: str | None, deadline: Deadline, *, confirmed: bool) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
         if digest is not None and digest != (question := self._question_of(experiment)).digest:
@@ -277,7 +280,7 @@ class Rig:
         try:
             if (reason := await self.memory.begins(experiment.file.name)) is not None:
                 return reason
-            reason = await self.runner.start(experiment.file, stops_before, deadline)
+            reason = await self.runner.start(experiment.file, stops_before, deadline, confirmed=confirmed)
         finally:
             self.memory.begun()
         if reason is None and self.recorder is not None:
@@ -294,24 +297,11 @@ class Rig:
         return self._question_of(experiment)
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
-        # Nothing runs while somebody asks, and nothing else needs the plan.
-        from shearloop.daemon.control.plan import plan_of
+        # Nothing runs while somebody asks, and nothing else needs its modules.
+        from shearloop.daemon.start_question import question_of
 
-        file = experiment.file
-        robot = self.experiments.robot
-        limits = robot.settings.limits if robot is not None else None
-        operator, tool = self.control_loop.operator, self.control_loop.tool
-        start, warm_up_s = operator.known_at_start(), self.control_loop.warm_up_s
-        plan = plan_of(file, limits, self.experiments.gripper, warm_up_s=warm_up_s, start=start)
-        motion, note = plan.first_motion, operator.activation_note(file)
-        text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-        if tool_note := self.experiments.tool_note(file):
-            sentences = (*sentences, f"  {tool_note}")
-        held = operator.release_stakes() if tool.may_hold() else ()
-        # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
-        digest = digest_of(experiment.data, text, *sentences, *self.occasion(), *held)
-        # The width in this note wavers.
-        return Question(text + operator.held_note(file), digest, sentences)
+        loop = self.control_loop
+        return question_of(experiment, self.experiments, loop.operator, loop.warm_up_s, *self.occasion())
 
     def occasion(self) -> tuple[str, ...]:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""

@@ -269,8 +269,8 @@ class ControlLoop:
         lasting = [one for one in found if not one.rule.is_past and one.code is not FaultCode.TORQUE_LIMIT]
         return _refusal_by(lasting) or self._awaited_judgement()
 
-    def start(self, file: ExperimentFile, t_ns: int) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin."""
+    def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin; `confirmed`: a held tool may drop."""
         if (reason := self.operator.start_refusal()) is not None:
             return reason
         if self.inputs.gripper is not None:
@@ -281,6 +281,8 @@ class ControlLoop:
         faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)
         if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
             return reason
+        if not confirmed and (drops := self.operator.drop_sentence(file)):
+            return f"{drops}; secure it, then confirm it with `shearloop command start --yes`"
         speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
         self.stated_tool_mm = file.tool_mm

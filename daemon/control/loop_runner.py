@@ -199,9 +199,14 @@ class ControlLoopRunner:
         return None
 
     async def start(
-        self, file: ExperimentFile, stops_before: int | None = None, deadline: Deadline = NO_DEADLINE
+        self,
+        file: ExperimentFile,
+        stops_before: int | None = None,
+        deadline: Deadline = NO_DEADLINE,
+        *,
+        confirmed: bool = False,
     ) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin.
+        """Begin an experiment; return None, or why it cannot begin; `confirmed` is as in `ControlLoop.start`.
 
         `stops_before` is the `stop_count` at the request, if the file was read since. `deadline` is checked once the
         arm is enabled.
@@ -222,7 +227,7 @@ class ControlLoopRunner:
         if (refusal := refusal or self.busy() or self._taring()) is not None:
             return refusal
         now_ns = self._clock.now_ns()
-        refusal = self._control_loop.start(file, now_ns)
+        refusal = self._control_loop.start(file, now_ns, confirmed=confirmed)
         if refusal is None:
             # A step that cannot be done ends it within the first decision: every listener sees it begin.
             self.states.publish_loop(self._sender.sent_rad_per_s, now_ns)

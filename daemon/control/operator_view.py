@@ -11,8 +11,8 @@ from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_a
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import (
     first_grip,
-    first_gripper_step,
     first_motion_before_grip,
+    first_opening,
     first_turn_before_tare,
 )
 from shearloop.daemon.torques import CONFIRM_TARE, SensorLoad, TorqueSource, load_of
@@ -137,7 +137,7 @@ class OperatorView:
     def release_question(self) -> str:
         """Return what a release would do, for the operator who confirms it."""
         if not self.tool.has_gripper:
-            present = f"at present {turned}" if (turned := self._clamped_turn()) else "no angle counts at present"
+            present = f"at present {turned}" if (turned := self.clamped_turn()) else "no angle counts at present"
             from_zero = "the angle of the clamped tool counts from 0 at the next start"
             return f"nothing opens, because no gripper is configured; {from_zero}; {present}"
         gripper = self.inputs.gripper
@@ -173,35 +173,21 @@ class OperatorView:
         may_hold = f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool"
         return activation_sentence(self.tool.held or may_hold)
 
-    def activation_note(self, file: ExperimentFile) -> str:
-        """Return a sentence on the activation before the first step with the gripper; empty without one."""
-        first = first_gripper_step(file)
-        if first is None or not self.tool.activates or not self.tool.may_hold():
+    def drop_sentence(self, file: ExperimentFile) -> str:
+        """Return which step lets go of what the fingers hold now, or may hold; empty if none does."""
+        gripper, held = self.inputs.gripper, self.tool.any_object
+        width_mm = gripper.width_mm if gripper is not None else 0.0
+        first = first_opening(file, width_mm, activates=self.tool.activates)
+        if held is None or first is None:
             return ""
-        number, _ = first
-        return f" Before step {number} the gripper is activated: its fingers open and close once, and a tool drops."
-
-    def held_note(self, file: ExperimentFile) -> str:
-        """Return a sentence on the held tool, for the question before a start; empty if no step turns it."""
-        if not self.tool.has_gripper:
-            turned = self._clamped_turn()
-            from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
-            return f" At present the clamped tool's angle continues: {turned}; {from_zero}." if turned else ""
-        held, unknown = self.tool.held, self.tool.unknown_grip
-        # A `grip` only closes tighter on the held tool, so the angle stays unknown.
-        tightens_unknown = bool(unknown) and first_grip(file) is not None
-        turns = tightens_unknown or first_motion_before_grip(file) is not None
-        if held is None or not turns:
-            return ""
-        angle = f" The grip is not known ({unknown}): its angle counts from the start." if unknown else ""
-        stated = self.tool.why_not_stated(file.tool_mm)
-        return f" At present {held}.{angle}{f' But {stated}.' if stated else ''}"
+        number, step = first
+        return f"step {number} ({step.do}) opens the gripper, and a tool in it drops; {held}"
 
     def known_at_start(self) -> KnownTool:
         """Return the known angle and torque of the tool at a start."""
         return known_at_start(loaded=self.tool.may_be_loaded(), twisted_rad=self.tool.twisted_rad)
 
-    def _clamped_turn(self) -> str:
+    def clamped_turn(self) -> str:
         """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""
         arm, origin_rad = self.inputs.arm, self.tool.grip.origin_rad
         if arm is None or origin_rad is None:

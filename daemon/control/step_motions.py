@@ -61,3 +61,18 @@ def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
         case (number, GripStep() as step):
             return number, step
     return None
+
+
+def first_opening(file: ExperimentFile, width_mm: float, *, activates: bool) -> tuple[int, GripperStep] | None:
+    """Return the first step that opens fingers that are `width_mm` apart, with its number from 1, or None.
+
+    `activates`: the first step that moves them activates the gripper, which opens them.
+    """
+    return next(
+        (
+            (number, step)
+            for number, step in enumerate(file.steps, 1)
+            if isinstance(step, ReleaseStep) or (isinstance(step, GripStep) and (activates or step.width_mm > width_mm))
+        ),
+        None,
+    )

@@ -252,7 +252,7 @@ class _Page:
         # The first press asks the question, the second press confirms it.
         if name in ASKED and "digest" not in arguments:
             arguments["ask"] = True
-        elif name == "release" or (name in ASKED_IF_NEEDED and "digest" in arguments):
+        elif name in ASKED or (name in ASKED_IF_NEEDED and "digest" in arguments):
             arguments["confirmed"] = True
         return await self._reply(name, self._bridge.command(name, clicked_ns, **arguments))
 

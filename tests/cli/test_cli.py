@@ -177,7 +177,7 @@ def test_a_calibration_of_another_bank_is_refused(config, tiny_bank, tmp_path, m
     [
         (["check", "no-such.yaml"], "no-such.yaml"),
         (["listen", "gel"], "there is no topic 'gel'. The topics are eit.frame, eit.estimate"),
-        (["command", "start", "--yes"], "--yes is for tare, unlock, release; leave it out of `start`"),
+        (["command", "pause", "--yes"], "--yes is for tare, start, unlock, release; leave it out of `pause`"),
         (["command", "pause", "--source", "left"], "--source is for tare; leave it out of `pause`"),
         (["command", "tare", "--experiment", "a.yaml"], "--experiment is for start; leave it out of `tare`"),
         (["listen", "skin.sheer"], "there is no topic 'skin.sheer'; did you mean skin.shear?"),

@@ -249,8 +249,9 @@ class Runner:
     def motion(self) -> str | None:
         return self.refusal
 
-    async def start(self, file: Any, stops_before: int, _deadline: Deadline) -> None:
+    async def start(self, file: Any, stops_before: int, _deadline: Deadline, *, confirmed: bool) -> None:
         self.started.append((file.name, stops_before))
+        self.confirmed = confirmed
 
 
 def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
@@ -259,10 +260,11 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
             warm_up_s=0.0,
             runs=1,
             safety=SimpleNamespace(acknowledgements=0),
-            tool=SimpleNamespace(may_hold=lambda: False),
             operator=SimpleNamespace(
-                activation_note=lambda _: "",
-                held_note=lambda _: "",
+                tool=SimpleNamespace(
+                    has_gripper=True, may_hold=lambda: False, activates=False, held=None, unknown_grip=""
+                ),
+                drop_sentence=lambda _: "",
                 file_refusal=lambda _: None,
                 known_at_start=lambda: AT_REST,
             ),
@@ -420,18 +422,21 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
         assert refused.value.facts == await start({"experiment": str(path), "ask": True})
     assert runner.started == []
     await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
-    path.write_bytes(before)
-    subject.control_loop.operator.activation_note = lambda _: " Before step 1 the gripper is activated."
-    with pytest.raises(CommandRefusedError, match="the effect of its start on a held tool has changed"):
-        await start({"experiment": str(path), "digest": asked["digest"]})
-    subject.control_loop.operator.activation_note = lambda _: ""
-    subject.control_loop.tool.may_hold = lambda: True
-    subject.control_loop.operator.release_stakes = lambda: ("held", "one tool")
+    write(path, {**VALID, "steps": [{"do": "release"}]})
+    asked = await start({"experiment": str(path), "ask": True})
+    operator = subject.control_loop.operator
+    operator.tool.may_hold, operator.release_stakes = lambda: True, lambda: ("held", "one tool")
     asked_again = await start({"experiment": str(path), "ask": True})
-    subject.control_loop.operator.release_stakes = lambda: ("held", "another tool")
+    operator.tool.activates = True
+    assert (
+        " Before step 1 the gripper is activated" in (await start({"experiment": str(path), "ask": True}))["question"]
+    )
+    with pytest.raises(CommandRefusedError, match="the effect of its start on a held tool has changed"):
+        await start({"experiment": str(path), "digest": asked_again["digest"]})
+    operator.tool.activates, operator.release_stakes = False, lambda: ("held", "another tool")
     with pytest.raises(CommandRefusedError, match="a held tool"):
         await start({"experiment": str(path), "digest": asked_again["digest"]})
-    subject.control_loop.tool.may_hold = lambda: False
+    operator.tool.may_hold = lambda: False
     # Somebody has pressed STOP since.
     runner.stop_count = 1
     with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect"):
@@ -440,9 +445,11 @@ async def test_what_a_person_confirmed_is_what_starts(folder):
     after_restart = answers_of(rig(folder, runner, instance="b2"))["start"]
     with pytest.raises(CommandRefusedError, match="since its plan was shown, the file or the effect"):
         await after_restart({"experiment": str(path), "digest": asked["digest"]})
-    await start({"experiment": str(path), "digest": asked["digest"]})
+    await start({"experiment": str(path), "digest": asked["digest"], "confirmed": True})
+    assert runner.confirmed
     # Who asks nothing names the file as it is.
     await start({"experiment": str(path)})
+    assert not runner.confirmed
     assert [name for name, _ in runner.started] == ["two", "one", "one"]
 
 

@@ -127,7 +127,7 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
     for _ in range(70):
         rig.step()
     file = ExperimentFile.model_validate({"name": "test", "steps": list(steps), **keys})
-    assert rig.control_loop.start(file, rig.t_ns) is None
+    assert rig.control_loop.start(file, rig.t_ns, confirmed=True) is None
     return rig
 
 

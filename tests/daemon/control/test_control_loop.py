@@ -437,8 +437,9 @@ def test_a_turn_is_refused_while_the_gripper_does_not_know_whether_it_holds_a_to
     rig.hand, rig.width_mm = replace(rig.hand, **sense), 43.2
     rig.step()
 
-    def refused(*steps: dict[str, Any]) -> str | None:
-        return rig.control_loop.start(ExperimentFile.model_validate({"name": "test", "steps": list(steps)}), rig.t_ns)
+    def refused(*steps: dict[str, Any], confirmed: bool = False) -> str | None:
+        file = ExperimentFile.model_validate({"name": "test", "steps": list(steps)})
+        return rig.control_loop.start(file, rig.t_ns, confirmed=confirmed)
 
     why = refused({"do": "wait", "wait_s": 1}, turning, GRIP)
     assert why == (
@@ -449,7 +450,7 @@ def test_a_turn_is_refused_while_the_gripper_does_not_know_whether_it_holds_a_to
     assert refused({"do": "tare"}, GRIP, turning) is None
     stop(rig)
     rig.control_loop.acknowledge()
-    assert refused({"do": "release"}, turning) is None
+    assert refused({"do": "release"}, turning, confirmed=True) is None
 
 
 def test_an_identification_of_nothing_is_refused():

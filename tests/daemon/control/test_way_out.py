@@ -28,6 +28,7 @@ from shearloop.daemon.messaging.stop_client import nothing_moved
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
+from shearloop.daemon.start_question import held_note
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
@@ -38,6 +39,7 @@ from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 from tests.fixtures.daemons import bound_handlers, of_now
 
 WAIT = {"do": "wait", "wait_s": 60}
+TURN = {"do": "twist", "angles_rad": [0.1]}
 RUNNING_RIG = RunningRig(instance="a1")
 THIS_DAEMON = {"process": os.getpid(), "instance": "a1"}
 
@@ -544,15 +546,59 @@ def test_the_question_before_a_turn_says_what_is_held():
         ExperimentFile.model_validate({"name": "test", "steps": steps})
         for steps in ([twist], [{"do": "release"}, twist])
     )
-    note = rig.control_loop.operator.held_note(file)
+    note = held_note(rig.control_loop.operator, file)
     assert note.startswith(
         " At present its fingers hold something 140.0 mm wide, with an unknown force. The grip is not"
     )
     assert note.endswith("its angle counts from the start.")
-    assert rig.control_loop.operator.held_note(after_release) == ""
+    drops = (
+        " Step 1 (release) opens the gripper, and a tool in it drops; its fingers hold something 140.0 mm wide, with an"
+    )
+    assert held_note(rig.control_loop.operator, after_release).startswith(drops)
     rig.force_n = 0.0
     rig.step()
-    assert rig.control_loop.operator.held_note(file) == ""
+    assert held_note(rig.control_loop.operator, file) == ""
+
+
+OPENS = "(release) opens the gripper, and a tool in it drops; "
+
+
+@pytest.mark.parametrize(
+    ("sense", "steps", "said"),
+    [
+        ({}, [{"do": "release"}], f"step 1 {OPENS}its fingers hold something 30.0 mm wide, with an unknown force"),
+        ({}, [WAIT, {"do": "release"}], f"step 2 {OPENS}"),
+        # The held tool is in the tighter grip too.
+        ({}, [GRIP, TURN, {"do": "release"}], f"step 3 {OPENS}"),
+        ({}, [GRIP, {"do": "grip", "width_mm": 140.0}], "step 2 (grip) opens the gripper, and a tool in it drops"),
+        ({"uncertain": True}, [{"do": "release"}], f"step 1 {OPENS}the gripper does not know whether it holds a tool"),
+        ({"unfelt": True}, [{"do": "grip", "width_mm": 140.0}], "step 1 (grip) opens the gripper, and a tool in it"),
+        ({"uncertain": True}, [GRIP, WAIT], None),
+        ({}, [GRIP, TURN], None),
+        ({}, [TURN], None),
+    ],
+)
+def test_no_start_lets_a_held_tool_go_without_a_confirmation(sense, steps, said):
+    rig = held(**sense)
+    rig.width_mm = 30.0
+    rig.run(0.1)
+    file = ExperimentFile.model_validate({"name": "test", "steps": steps, "limits": {"angle_rad": 1.0}})
+    refused = rig.control_loop.start(file, rig.t_ns)
+    if said is None:
+        assert refused is None
+        return
+    assert refused.startswith(said)
+    assert refused.endswith("; secure it, then confirm it with `shearloop command start --yes`")
+    assert rig.control_loop.running is None
+    assert rig.control_loop.start(file, rig.t_ns, confirmed=True) is None
+
+
+def test_a_start_with_empty_fingers_asks_nothing():
+    rig = held()
+    rig.force_n = 0.0
+    rig.run(0.1)
+    file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release"}, GRIP, {"do": "release"}]})
+    assert rig.control_loop.start(file, rig.t_ns) is None
 
 
 @pytest.mark.parametrize("sense", [{}, {"uncertain": True}])
@@ -565,7 +611,7 @@ def test_no_straight_move_begins_with_a_tool_that_is_or_may_be_gripped(sense):
 
     said = refusal({"do": "wait", "wait_s": 1}, move) or ""
     assert said.endswith("put a `grip` or a `release` before step 2 (approach), which moves the arm")
-    assert refusal({"do": "release"}, move) is None
+    assert (refusal({"do": "release"}, move) or "").startswith(f"step 1 {OPENS}")
 
 
 @pytest.mark.parametrize(
@@ -718,9 +764,9 @@ def test_a_stated_diameter_that_an_uncalibrated_gripper_does_not_fit_is_noted_wh
     file = ExperimentFile.model_validate(
         {"name": "test", "tool_mm": 20.0, "steps": [{"do": "twist", "angles_rad": [1]}]}
     )
-    assert "But the experiment states a tool of 20 mm" in rig.control_loop.operator.held_note(file)
+    assert "But the experiment states a tool of 20 mm" in held_note(rig.control_loop.operator, file)
     as_stated = file.model_copy(update={"tool_mm": 40.0})
-    assert "states" not in rig.control_loop.operator.held_note(as_stated)
+    assert "states" not in held_note(rig.control_loop.operator, as_stated)
 
 
 @pytest.mark.parametrize("released", [False, True])

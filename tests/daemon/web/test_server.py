@@ -162,7 +162,7 @@ async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
             assert (await post(page, f"/commands/{path}", **BEARER))[0] == 200
         assert requests == [
             {"experiment": "a b.yaml", "ask": True},
-            {"digest": "d", "experiment": "x"},
+            {"digest": "d", "experiment": "x", "confirmed": True},
             {"ask": True},
             {"digest": "d", "confirmed": True},
         ]

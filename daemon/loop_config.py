@@ -1,8 +1,13 @@
 """The settings of the closed loop, `loop` in the configuration."""
 
+from typing import TYPE_CHECKING, Self
+
 from pydantic import Field
 
 from shearloop.daemon.config_file import ConfigModel
+
+if TYPE_CHECKING:
+    from shearloop.drivers.ur.settings import UrLimits
 
 
 class LoopConfig(ConfigModel):
@@ -39,6 +44,11 @@ class LoopConfig(ConfigModel):
     )
     gain_margin: float = Field(default=2.0, ge=1, le=100, description="minimum gain margin, as a factor")
     phase_margin_deg: float = Field(default=45.0, ge=0, le=90, description="minimum phase margin")
+
+    def within(self, robot: "UrLimits") -> Self:
+        """Return the settings with the speed and the acceleration that the robot's limits leave of them."""
+        names = ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
+        return self.model_copy(update={name: min(getattr(self, name), getattr(robot, name).inner) for name in names})
 
     @property
     def planned_acceleration_rad_per_s2(self) -> float:

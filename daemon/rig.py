@@ -167,15 +167,11 @@ def make_loop(
     """
     sources = {**sources, WRENCH: wrench_source(robot.rate_hz, robot.facts.mean_noise_nm)}
     # Controller, identification and commands plan with what the worker lets through.
-    limited = {
-        name: min(getattr(config.loop, name), getattr(robot.limits, name).inner)
-        for name in ("wrist_speed_rad_per_s", "wrist_acceleration_rad_per_s2")
-    }
+    loop = config.loop.within(robot.limits)
     if is_patient(config):
-        limited["stale_after_s"] = max(config.loop.stale_after_s, EMULATED_STALE_S)
+        loop = loop.model_copy(update={"stale_after_s": max(loop.stale_after_s, EMULATED_STALE_S)})
     if supplied.actuation_s is not None and "actuation_s" not in config.loop.model_fields_set:
-        limited["actuation_s"] = supplied.actuation_s
-    loop = config.loop.model_copy(update=limited)
+        loop = loop.model_copy(update={"actuation_s": supplied.actuation_s})
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
     gels = {
         name: Creep(fingertip.creep.share, fingertip.creep.time_s)

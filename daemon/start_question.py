@@ -20,7 +20,8 @@ def question_of(
     """
     file = experiment.file
     limits = files.robot.settings.limits if files.robot is not None else None
-    plan = plan_of(file, limits, files.gripper, warm_up_s=warm_up_s, start=operator.known_at_start())
+    start, loop = operator.known_at_start(), files.config.loop
+    plan = plan_of(file, limits, files.gripper, warm_up_s=warm_up_s, start=start, loop=loop)
     motion, note = plan.first_motion, activation_note(operator, file)
     text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
     if tool_note := files.tool_note(file):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
     from shearloop.daemon.control.plan import Plan
+    from shearloop.daemon.loop_config import LoopConfig
     from shearloop.daemon.torques import TorqueSource
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits
@@ -119,7 +120,7 @@ def _check_experiment(
         document = read_document(config.experiment)
         mistakes = experiment_mistakes(document.content, config, sources, robot)
         limits = robot.settings.limits if robot is not None else None
-        _add_plan(parts, document, mistakes, limits, config.gripper_model, warm_up_s)
+        _add_plan(parts, document, mistakes, limits, config.gripper_model, warm_up_s, config.loop)
     experiment = check_experiment(config, sources, robot)
     if experiment is not None:
         text = f"{experiment.name!r}, {counted(len(experiment.steps), 'step')}, driven by {experiment.torque_source}"
@@ -166,6 +167,7 @@ def _add_plan(
     robot: "UrLimits | None" = None,
     gripper: "GripperModel | None" = None,
     warm_up_s: float = 0.0,
+    loop: "LoopConfig | None" = None,
 ) -> None:
     """Add the plan of an experiment with valid keys and values."""
     from shearloop.daemon.control.experiment_schema import ExperimentFile
@@ -177,7 +179,7 @@ def _add_plan(
             refused[place[0]] = (*refused.get(place[0], ()), why)
     # A file that cannot be read is named with its mistakes.
     with suppress(UserError):
-        parts.plans.append(plan_of(document.model(ExperimentFile), robot, gripper, refused, warm_up_s))
+        parts.plans.append(plan_of(document.model(ExperimentFile), robot, gripper, refused, warm_up_s, loop=loop))
 
 
 def _torque(calibration: "Calibration") -> str:

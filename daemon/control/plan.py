@@ -12,6 +12,7 @@ from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownToo
 from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
 from shearloop.daemon.control.turns import Turn, either_way, reversals, turns, ways_between
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM, GripperModel
 from shearloop.drivers.ur.settings import UrLimits
@@ -148,11 +149,12 @@ def _listed(some: Iterable[StepPlan]) -> str:
     return ", ".join(f"{step.number} ({step.do})" for step in some)
 
 
-def speeds_of(robot: UrLimits | None) -> Speeds:
-    """Return the largest speeds within the robot's limits; as asked where these are not known."""
+def speeds_of(robot: UrLimits | None, loop: LoopConfig | None) -> Speeds:
+    """Return the largest speeds of the loop within the robot's limits; as asked where these are not known."""
     if robot is None:
         return AS_ASKED
-    return Speeds(robot.wrist_speed_rad_per_s.inner, robot.linear_speed_m_per_s.inner)
+    turns = robot.wrist_speed_rad_per_s.inner if loop is None else loop.within(robot).wrist_speed_rad_per_s
+    return Speeds(turns, robot.linear_speed_m_per_s.inner)
 
 
 def plan_of(
@@ -162,13 +164,14 @@ def plan_of(
     refused: Mapping[int, tuple[str, ...]] | None = None,
     warm_up_s: float = 0.0,
     start: KnownTool | None = None,
+    loop: LoopConfig | None = None,
 ) -> Plan:
-    """Return the plan of an experiment within the limits of the robot and the gripper, where they are known.
+    """Return the plan of an experiment within the limits of the robot, the gripper and the loop, where they are known.
 
     `refused` has the reasons against each step by its index. `warm_up_s` passes after a grip or a tare until the first
     torque. `start` is the known state of the tool at the start; None: it is assumed to be neither turned nor loaded.
     """
-    speeds = speeds_of(robot)
+    speeds = speeds_of(robot, loop)
     known = AT_REST if start is None else start
     ways = _ways_of(file, known)
     found_turns = tuple(turns(file, known))
@@ -179,7 +182,7 @@ def plan_of(
     expected = zip(file.steps, found_turns, demands(file.steps, speeds, known), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
         duration_s = needs.takes_s
-        notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot)]
+        notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot, speeds)]
         if number in waits:
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {waits[number]}")
             duration_s += warm_up_s
@@ -392,7 +395,7 @@ def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
     return False
 
 
-def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None) -> Iterator[str]:
+def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None, speeds: Speeds) -> Iterator[str]:
     """Yield what a step's limits and the robot's change."""
     if isinstance(step, steps.GripStep) and file.tool_mm is not None and step.width_mm > file.tool_mm - FELT_MM:
         most_mm = max(0.0, file.tool_mm - FELT_MM)
@@ -410,16 +413,17 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None)
         return
     match step:
         case steps.ApproachStep():
-            largest_m_per_s = robot.linear_speed_m_per_s.inner
+            largest_m_per_s = speeds.linear_m_per_s
             if step.speed_m_per_s > largest_m_per_s:
                 yield f"it asks for {step.speed_m_per_s:g} m/s, and the robot's limit allows {largest_m_per_s:g} m/s"
             if step.pose_m_rad is None:
                 yield "its end is checked against the workspace as it begins: it depends on where the tool is"
         case steps.TwistStep() | steps.TurnToStep() | steps.TightenStep():
-            largest_rad_per_s = robot.wrist_speed_rad_per_s.inner
+            largest_rad_per_s = speeds.wrist_rad_per_s
             if step.speed_rad_per_s > largest_rad_per_s:
-                asks = f"it asks for {step.speed_rad_per_s:g} rad/s"
-                yield f"{asks}, and the robot's limit allows {largest_rad_per_s:g} rad/s"
+                by_robot = largest_rad_per_s == robot.wrist_speed_rad_per_s.inner
+                limit = "the robot's limit" if by_robot else "`loop.wrist_speed_rad_per_s`"
+                yield f"it asks for {step.speed_rad_per_s:g} rad/s, and {limit} allows {largest_rad_per_s:g} rad/s"
 
 
 def _largest_angle(step: Step, needs: Demand) -> float:

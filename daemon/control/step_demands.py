@@ -106,8 +106,9 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
             return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)
         case IdentifyStep(amplitude_rad=angle_rad, hold_s=hold_s):
-            # Two cycles at least; the first of their five rests is twice as long.
-            return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=5.0)
+            # Two cycles at least, to half of the angle and to all of it; the first of five rests is twice as long.
+            moves_s = 3.0 * angle_rad / speeds.wrist_rad_per_s + 5.0 * SETTLES_S
+            return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=moves_s)
         case TwistStep(angles_rad=angles_rad):
             return _twist_demand(step, angles_rad, speeds, before.tool)
         case WaitStep(wait_s=wait_s):

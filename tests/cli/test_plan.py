@@ -16,8 +16,9 @@ from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.sensing.sessions import torque_sources
+from shearloop.daemon.start_question import question_of
 from shearloop.drivers.ur.settings import UrLimits, read_settings
-from tests.daemon.control.loop_rig import TICK_S, Rig, new_loop, phase, started
+from tests.daemon.control.loop_rig import CONFIG, TICK_S, Rig, new_loop, phase, started
 from tests.fixtures.daemons import collector, running_daemon, shearloop
 from tests.fixtures.robots import write_filled_in
 
@@ -368,6 +369,46 @@ def test_a_timeout_that_may_end_a_step_early_is_named():
     first, second = plan_of(file).steps
     assert first.notes == ("its timeout_s of 1 s may stop it before its end",)
     assert second.notes == ()
+
+
+SLOW_RAD_PER_S = 0.05
+
+
+def test_the_plan_has_the_speeds_of_the_loop_where_they_are_below_the_robots(tmp_path, result_of):
+    turn = {"do": "turn_to", "angle_rad": 0.0, "speed_rad_per_s": 0.2}
+    steps = ({"do": "release"}, turn, {**turn, "angle_rad": 1.0}, GRIP, {"do": "identify"})
+    path = written(tmp_path, *steps, limits={"torque_nm": 0.3, "angle_rad": 1.0})
+    config = rig(tmp_path, loop={"wrist_speed_rad_per_s": SLOW_RAD_PER_S})
+    planned = result_of("check", path, "--config", config)["plan"]["steps"]
+    assert planned[2]["text"].endswith("at 0.05 rad/s")
+    assert planned[2]["duration_s"] == pytest.approx(1.0 / SLOW_RAD_PER_S + 0.5)
+    assert planned[2]["notes"] == ["it asks for 0.2 rad/s, and `loop.wrist_speed_rad_per_s` allows 0.05 rad/s"]
+    # To half of 0.2 rad and to 0.2 rad, and back: 0.6 rad in all.
+    assert planned[4]["duration_s"] == pytest.approx(6 * 2.5 + 0.6 / SLOW_RAD_PER_S + 2.5)
+
+
+async def test_the_question_before_a_start_has_the_speeds_of_the_loop(tmp_path):
+    config = load_daemon_config(rig(tmp_path, loop={"wrist_speed_rad_per_s": SLOW_RAD_PER_S}))
+    path = written(tmp_path, {"do": "release"}, {"do": "turn_to", "angle_rad": 0.0, "speed_rad_per_s": 0.2})
+    robot = Commissioning(read_settings(ROBOT), None, emulated=True)
+    files = ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot, LoadedFiles(()))
+    question = question_of(await files.read(path), files, Rig(new_loop()).control_loop.operator, 0.0)
+    assert "turns wrist 3 to 0 rad (0°) at 0.05 rad/s" in "".join(question.plan)
+
+
+@pytest.mark.parametrize(("speed_rad_per_s", "amplitude_rad"), [(0.05, 0.2), (0.2, 0.2), (0.5, 0.1)])
+def test_the_planned_duration_of_an_identification_is_about_the_real_one(speed_rad_per_s, amplitude_rad):
+    config = CONFIG.model_copy(update={"wrist_speed_rad_per_s": speed_rad_per_s})
+    step = {"do": "identify", "amplitude_rad": amplitude_rad, "hold_s": 0.8}
+    rig = started(Rig(new_loop(config)), GRIP, step, torque_source="load_cell", limits={"torque_nm": 1, "angle_rad": 1})
+    while rig.control_loop.experiment.step_number == 1:
+        rig.step()
+    begun = rig.tick
+    rig.run(120)
+    assert phase(rig) is ExperimentPhase.DONE
+    robot = read_settings(ROBOT).limits
+    planned_s = plan_of(rig.control_loop.experiment.file, robot, loop=config).steps[1].duration_s
+    assert (rig.tick - begun) * TICK_S == pytest.approx(planned_s, rel=0.2)
 
 
 @pytest.mark.parametrize("speed_rad_per_s", [0.1, 0.2, 0.5])

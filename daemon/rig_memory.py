@@ -6,8 +6,10 @@ Each robot has a file.
 import asyncio
 import errno
 import json
+import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -42,8 +44,9 @@ class Remembered:
 
     # The name of the experiment that runs.
     running: str = ""
-    # Code and detail of each fault of the stop that waits for the operator.
+    # Code and detail of each fault of the stop that waits for the operator, and its Unix time in s, where it is known.
     stop: tuple[tuple[str, str], ...] = ()
+    stopped_s: float | None = None
     # The grip, as `Grip` has it.
     origin_rad: float | None = None
     force_n: float | None = None
@@ -83,7 +86,8 @@ class Remembered:
             # A stored stop has details that the earlier process has joined.
             if not any(detail in one for one in of_code):
                 of_code.append(detail)
-        return tuple(Fault(code, "; ".join(of_code)) for code, of_code in details.items())
+        at = "" if self.stopped_s is None else f"{datetime.fromtimestamp(self.stopped_s):%Y-%m-%d %H:%M}"
+        return tuple(Fault(code, "; ".join(of_code), stopped_at=at) for code, of_code in details.items())
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":
@@ -91,7 +95,7 @@ class Remembered:
         running = loop.running_experiment.file.name if loop.running_experiment is not None else ""
         faults = loop.safety.waiting.faults if loop.safety.waiting is not None else ()
         stop = tuple((fault.code.name, fault.detail) for fault in faults)
-        return cls(running, stop, **asdict(loop.tool.grip), stated_tool_mm=loop.stated_tool_mm)
+        return cls(running, stop, None, **asdict(loop.tool.grip), stated_tool_mm=loop.stated_tool_mm)
 
     def restore(self, loop: ControlLoop, on_judged: OnJudged = lambda _: None) -> None:
         """Give the stored state to a new control loop; a restored stop keeps the grip, even if it had opened it."""
@@ -134,6 +138,9 @@ class RigMemory:
     _starting: str = ""
     # The state in the file.
     _written: Remembered | None = None
+    # Whether a stop waits, and when it began; None for one of an earlier process that ended without a word.
+    _stop_waits: bool = False
+    _stopped_s: float | None = None
     # The load cell's zero in its calibration, and the restored zero.
     _calibrated_zero: float | None = None
     _load_restored: float | None = None
@@ -145,6 +152,7 @@ class RigMemory:
         """Give the state that the last daemon of this robot has left to loop, load cell and robot, before they run."""
         remembered = self._written = read_memories(self.files)
         remembered.restore(self.loop, self._on_judged)
+        self._stop_waits, self._stopped_s = bool(remembered.faults), remembered.stopped_s
         clamped = not self.loop.tool.has_gripper
         if clamped and remembered.force_n is not None:
             # They are of a grip, and the configuration does not name that gripper any more.
@@ -210,7 +218,11 @@ class RigMemory:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self.wrench.watch()
         state = Remembered.of(self.loop)
-        state = replace(state, running=state.running or self._starting)
+        if state.stop and not self._stop_waits:
+            self._stopped_s = time.time()
+        self._stop_waits = bool(state.stop)
+        stopped_s = self._stopped_s if state.stop else None
+        state = replace(state, running=state.running or self._starting, stopped_s=stopped_s)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)

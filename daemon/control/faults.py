@@ -294,6 +294,8 @@ class FaultCode(Enum):
 
 
 TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
+# The cure of a fault that is over.
+_UNLOCK = "Look at the rig, then send `shearloop command unlock`."
 # The longest hold by several alternating faults.
 LONGEST_HOLD_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
@@ -307,6 +309,10 @@ class Fault:
     is_consequence: bool = False
     # When its cause was measured (CLOCK_MONOTONIC), if a measurement shows it.
     t_ns: int | None = field(default=None, compare=False)
+    # When it stopped the rig of an earlier process, by the wall clock; empty for a fault of this process.
+    stopped_at: str = field(default="", compare=False)
+    # Whether it is known to be over, though its stop still waits for the operator.
+    is_over: bool = field(default=False, compare=False)
 
     @property
     def rule(self) -> Rule:
@@ -315,11 +321,14 @@ class Fault:
 
     @property
     def cause(self) -> str:
-        """The sentence without its full stop, and without the cure."""
+        """The sentence without its full stop, and without the cure; first when it was, where it is told of the past."""
+        past = [f"stopped at {self.stopped_at}"] if self.stopped_at else []
+        past += ["over by now"] if self.is_over else []
         # A driver's detail may end with a full stop; the sentence has its own.
-        return self.rule.sentence.format(detail=self.detail.removesuffix(".")).removesuffix(".")
+        sentence = self.rule.sentence.format(detail=self.detail.removesuffix(".")).removesuffix(".")
+        return f"{', '.join(past)}: {sentence}" if past else sentence
 
     @property
     def sentence(self) -> str:
         """The operator's sentence, with the cure."""
-        return f"{self.cause}. {self.rule.cure}"
+        return f"{self.cause}. {_UNLOCK if self.is_over else self.rule.cure}"

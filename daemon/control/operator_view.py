@@ -47,8 +47,8 @@ class OperatorView:
         """Return why no experiment can begin, or None."""
         if (reason := self.running_refusal()) is not None:
             return reason
-        if (stop := self.safety.waiting) is not None:
-            first, *others = stop.faults
+        if refusing := self.safety.refusing:
+            first, *others = refusing
             also = f" Also: {'; '.join(fault.cause for fault in others)}." if others else ""
             return f"{first.sentence}{also}"
         return None

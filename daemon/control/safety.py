@@ -8,6 +8,13 @@ from shearloop.daemon.control.faults import LONGEST_HOLD_S, TABLE, Fault, FaultC
 # A hold's timer runs down at this rate while its fault is absent: a fault that is present for more than a third of the
 # time becomes a stop.
 DECAY = 0.5
+# Robot and gripper show these at rest too, as long as they last, unless another fault of a device hides them.
+_SHOWN_AT_REST = {FaultCode.ROBOT_BLOCKED, FaultCode.PROTECTIVE_STOP, FaultCode.EMERGENCY_STOP, FaultCode.GRIPPER_FAULT}
+_OF_DEVICES = (
+    _SHOWN_AT_REST
+    | {FaultCode.ROBOT_LOST, FaultCode.DEVICE_LOST, FaultCode.STATE_STALE}
+    | {FaultCode.DEVICE_AWAITED, FaultCode.ROBOT_STARTING, FaultCode.ROBOT_UNCONTROLLED}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +83,8 @@ class SafetyMonitor:
         # Each fault's contribution to the wrist's timer, for the report.
         self._share_ns: dict[FaultCode, int] = {}
         self._judged_ns: int | None = None
+        # The faults of the latest judgement or report; None before the first one.
+        self._active: tuple[Fault, ...] | None = None
 
     def begin_experiment(self) -> None:
         """Count the hold time from now on."""
@@ -83,7 +92,7 @@ class SafetyMonitor:
 
     def judge(self, faults: Iterable[Fault], t_ns: int) -> SafetyDecision:
         """Return the response to the faults at t_ns (monotonic clock) while an experiment runs."""
-        active = tuple(faults)
+        active = self._active = tuple(faults)
         if active or self._wrist_ns or self._holding:
             self._count(active, t_ns)
         self._judged_ns = t_ns
@@ -103,7 +112,7 @@ class SafetyMonitor:
 
     def report(self, faults: Iterable[Fault]) -> SafetyDecision:
         """Return the faults while nothing moves: a pending stop is kept, and only the robot's own stops begin one."""
-        active = tuple(faults)
+        active = self._active = tuple(faults)
         self._reset_timers()
         for fault in active:
             if fault.rule.stops_at_rest:
@@ -143,6 +152,14 @@ class SafetyMonitor:
         self._reset_timers()
 
     @property
+    def refusing(self) -> tuple[Fault, ...]:
+        """The faults of the stop that waits, its cause first, and the present ones that refuse a start."""
+        if self.waiting is None or self._active is None:
+            return self.waiting.faults if self.waiting is not None else ()
+        told = self._with_stop(self.waiting, self._active).reported
+        return (*told[:1], *(fault for fault in told[1:] if fault.rule.response >= Response.REFUSE_START))
+
+    @property
     def stop_number(self) -> int:
         """The number of the stop that waits for the operator; 0 without one."""
         return self.waiting.number if self.waiting is not None else 0
@@ -161,7 +178,8 @@ class SafetyMonitor:
         codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.
         known = {fault.code for fault in stop.faults}
-        kept = [fault for fault in stop.faults if fault.code not in codes]
+        over = set() if codes & _OF_DEVICES else _SHOWN_AT_REST
+        kept = [replace(one, is_over=one.code in over) for one in stop.faults if one.code not in codes]
         kept += [fault for fault in active if fault.code in known]
         order = list(dict.fromkeys(fault.code for fault in stop.faults))
         kept.sort(key=lambda fault: order.index(fault.code))

@@ -9,6 +9,7 @@ from shearloop.daemon.control.experiment_schema import (
     GripperStep,
     GripStep,
     ReleaseStep,
+    Step,
     TareStep,
     TurnToStep,
     TwistingStep,
@@ -63,16 +64,13 @@ def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
     return None
 
 
-def first_opening(file: ExperimentFile, width_mm: float, *, activates: bool) -> tuple[int, GripperStep] | None:
+def first_opening(file: ExperimentFile, width_mm: float, *, activates: bool) -> tuple[int, Step] | None:
     """Return the first step that opens fingers that are `width_mm` apart, with its number from 1, or None.
 
     `activates`: the first step that moves them activates the gripper, which opens them.
     """
-    return next(
-        (
-            (number, step)
-            for number, step in enumerate(file.steps, 1)
-            if isinstance(step, ReleaseStep) or (isinstance(step, GripStep) and (activates or step.width_mm > width_mm))
-        ),
-        None,
-    )
+    for number, step in enumerate(file.steps, 1):
+        opens = isinstance(step, GripStep) and (activates or step.width_mm > width_mm)
+        if opens or isinstance(step, ReleaseStep):
+            return number, step
+    return None

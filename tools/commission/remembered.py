@@ -63,7 +63,7 @@ class LeftRobot:
         operator.act(
             "Look at the rig, and clear what stopped it. The commissioning makes the robot ready to move again", _PLAYED
         )
-        left._keep(replace(state, stop=(), running=""))
+        left._keep(replace(state, stop=(), stopped_s=None, running=""))
         return left
 
     @contextmanager

@@ -689,7 +689,7 @@ def test_a_stop_of_the_robot_itself_waits_for_the_operator_also_where_nothing_mo
     file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "wait", "wait_s": 1}]})
     refused = rig.control_loop.start(file, rig.t_ns)
     assert refused is not None
-    assert refused.startswith(FaultCode[own_stop.upper()].value.kind)
+    assert refused.startswith(f"over by now: {FaultCode[own_stop.upper()].value.kind}")
     assert refused.count("`shearloop command unlock`") == 1
     rig.control_loop.acknowledge()
     rig.step()

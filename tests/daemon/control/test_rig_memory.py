@@ -6,6 +6,7 @@ import os
 import threading
 from collections.abc import Iterator, MutableMapping
 from dataclasses import asdict, replace
+from datetime import datetime
 from types import SimpleNamespace
 from typing import Any
 
@@ -86,6 +87,70 @@ def test_a_stop_is_remembered_until_it_is_acknowledged(kind):
     after.control_loop.acknowledge()
     again = after_restart(after)
     assert refusal(again) == ""
+
+
+SLIDER = "The speed slider is at 50 %: set it to 100 % at the bottom of the teach pendant's screen."
+PAYLOAD = "The controller has a payload of 1.5 kg, and the settings say 1 kg."
+STOPPED_S = datetime(2026, 11, 30, 12, 3).timestamp()
+
+
+@pytest.mark.parametrize("now", ["", SLIDER, PAYLOAD])
+async def test_a_remembered_stop_says_when_it_was_and_a_present_cause_that_it_is(now, monkeypatch):
+    monkeypatch.setattr(rig_memory.time, "time", lambda: STOPPED_S)
+    rig = started(Rig(new_loop()), WAIT)
+    rig.run(1)
+    memory = memory_of(rig.control_loop)
+    await memory.save_present()
+    rig.arm = replace(rig.arm, blocked=SLIDER)
+    rig.run(1)
+    assert rig.control_loop.status.decision.reasons[0].startswith(
+        "the robot does not move: The speed slider is at 50 %"
+    )
+    await memory.save_present()
+    # The time is the stop's, also after two restarts.
+    for later_s in (3600.0, 86400.0):
+        monkeypatch.setattr(rig_memory.time, "time", lambda later_s=later_s: STOPPED_S + later_s)
+        after = Rig(new_loop())
+        memory = memory_of(after.control_loop)
+        before_states = refusal(after)
+        assert before_states.startswith("stopped at 2026-11-30 12:03: the robot does not move: The speed slider")
+        after.arm = replace(after.arm, blocked=now)
+        after.run(0.6)
+        await memory.save_present()
+    if now:
+        assert refusal(after).startswith(f"the robot does not move: {now.removesuffix('.')}. Clear the cause and send")
+    else:
+        over = "stopped at 2026-11-30 12:03, over by now: the robot does not move: The speed slider is at 50 %"
+        assert refusal(after).startswith(over)
+        assert refusal(after).endswith("Look at the rig, then send `shearloop command unlock`.")
+        assert after.control_loop.status.decision.reasons[0].startswith(over)
+    assert (SLIDER in refusal(after)) is (now == SLIDER) or not now, "one reply does not name two"
+    after.control_loop.acknowledge()
+    after.run(0.1)
+    await memory.save_present()
+    assert read_memory(FILES.state).stopped_s is None
+
+
+def test_a_cause_that_is_over_is_told_so_and_what_is_wrong_now_beside_it():
+    rig = started(Rig(new_loop()), WAIT)
+    rig.run(1)
+    rig.arm = replace(rig.arm, blocked=SLIDER)
+    rig.run(1)
+    rig.arm = replace(rig.arm, blocked="")
+    rig.control_loop.on_recording_error("the disk is full")
+    rig.step()
+    assert refusal(rig) == (
+        f"over by now: the robot does not move: {SLIDER} Look at the rig, then send `shearloop command unlock`. "
+        "Also: the recording cannot be written: the disk is full."
+    )
+    # The emergency stop is all that the robot says then.
+    rig.arm = replace(rig.arm, emergency_stop=True)
+    rig.step()
+    assert refusal(rig).startswith("the robot does not move: The speed slider")
+    rig.silent.add("arm")
+    for _ in range(100):
+        rig.step()
+    assert refusal(rig).startswith("the robot does not move: The speed slider"), "nobody knows whether it is over"
 
 
 def test_the_force_of_a_grip_is_remembered_while_the_fingers_close():

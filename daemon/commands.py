@@ -204,18 +204,20 @@ class Commands:
         return {}
 
     async def _unlock(self, request: Request) -> Reply:
+        from shearloop.daemon.operator_questions import release_stakes, unlock_question
+
         rig = required_rig(self.rig)
         loop, confirmed = rig.control_loop, bool(request.get("confirmed"))
         _refuse_if(rig.runner.unlock_refusal())
         # A stop since the latest state waits too.
         rig.runner.decide_now()
-        another, drops = loop.operator.why_another_stop(request.get("stop")), loop.operator.unlock_question()
+        another, drops = loop.operator.why_another_stop(request.get("stop")), unlock_question(loop.operator)
         if another or drops:
             sentence = "; ".join(filter(None, (another, drops)))
             what = "drops" if drops else "acknowledges", f"stop {loop.safety.stop_number}"
             question = Question(
                 f"Unlock? {_capital(sentence)}.",
-                digest_of("unlock", *what, *rig.occasion(), *loop.operator.release_stakes()),
+                digest_of("unlock", *what, *rig.occasion(), *release_stakes(loop.operator)),
             )
             if another and request.get("digest") != question.digest:
                 raise CommandRefusedError(f"{another}; look at the rig, and unlock it again", **question.facts)
@@ -227,12 +229,14 @@ class Commands:
         return {}
 
     async def _release(self, request: Request) -> Reply:
+        from shearloop.daemon.operator_questions import release_question, release_stakes
+
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())
-        sentence = rig.control_loop.operator.release_question()
+        sentence = release_question(rig.control_loop.operator)
         question = Question(
             f"Release? {_capital(sentence)}.",
-            digest_of("release", *rig.occasion(), *rig.control_loop.operator.release_stakes()),
+            digest_of("release", *rig.occasion(), *release_stakes(rig.control_loop.operator)),
         )
         if request.get("ask"):
             return dict(question.facts)

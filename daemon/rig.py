@@ -287,14 +287,16 @@ class Rig:
         """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
         if (reason := self.start_refusal()) is not None:
             raise UserError(reason)
+        from shearloop.daemon.operator_questions import file_refusal
+
         experiment = await self.experiments.read(path)
-        if (reason := self.control_loop.operator.file_refusal(experiment.file)) is not None:
+        if (reason := file_refusal(self.control_loop.operator, experiment.file)) is not None:
             raise UserError(reason)
         return self._question_of(experiment)
 
     def _question_of(self, experiment: ReadExperiment) -> Question:
         # Nothing runs while somebody asks, and nothing else needs its modules.
-        from shearloop.daemon.start_question import question_of
+        from shearloop.daemon.operator_questions import question_of
 
         loop = self.control_loop
         return question_of(experiment, self.experiments, loop.operator, loop.warm_up_s, *self.occasion())

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, TareStep
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
-from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
+from shearloop.daemon.control.known_tool import UNTURNED_RAD
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import (
     first_grip,
@@ -57,14 +57,6 @@ class OperatorView:
         """Return the running experiment as the reason of a refusal, or None."""
         running = self.running_experiment()
         return f"the experiment {running.file.name!r} is running; stop it first" if running is not None else None
-
-    def file_refusal(self, file: ExperimentFile) -> str | None:
-        """Return why this experiment cannot begin with the present tool and zeros, or None."""
-        if (reason := self.why_not_with_tool(file)) is not None:
-            return reason
-        if isinstance(file.steps[0], TareStep) and (reason := self.why_no_tare_step()) is not None:
-            return f"step 1 (tare): {reason}"
-        return None
 
     def tare_refusal(self, *, confirmed: bool = False) -> str | None:
         """Return why no zero may be taken at present, or None; `confirmed`: by the operator, nothing is loaded."""
@@ -134,18 +126,6 @@ class OperatorView:
             return f"the gripper is not connected: {reason.removesuffix('.')}; `shearloop doctor CONFIG` examines it"
         return None
 
-    def release_question(self) -> str:
-        """Return what a release would do, for the operator who confirms it."""
-        if not self.tool.has_gripper:
-            present = f"at present {turned}" if (turned := self.clamped_turn()) else "no angle counts at present"
-            from_zero = "the angle of the clamped tool counts from 0 at the next start"
-            return f"nothing opens, because no gripper is configured; {from_zero}; {present}"
-        gripper = self.inputs.gripper
-        apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
-        what = self.tool.held or f"the gripper reports no object, and {apart}"
-        renewed = "; it is activated first: the fingers open and close once" if self.tool.activates else ""
-        return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
-
     def why_another_stop(self, named: int | None) -> str:
         """Return why an unlock names another stop than the one that waits; empty if it names this stop or none.
 
@@ -156,23 +136,6 @@ class OperatorView:
             return ""
         return f"the stop that waits is not the one that was shown: {stop.causes}"
 
-    def release_stakes(self) -> tuple[str, ...]:
-        """Return the facts that a confirmation of `release_question` covers; the width varies and is none of them."""
-        held = "held" if self.tool.held is not None else "nothing held"
-        renewed = "renewed" if self.tool.activates else "as it is"
-        # An exchanged tool shows as another request, or as another angle.
-        gripper, grip = self.inputs.gripper, self.tool.grip
-        requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
-        return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
-
-    def unlock_question(self) -> str:
-        """Return what an unlock would drop, for the operator who confirms it; empty if it drops no tool."""
-        gripper = self.inputs.gripper
-        if gripper is None or not gripper.fault or not self.tool.may_hold():
-            return ""
-        may_hold = f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool"
-        return activation_sentence(self.tool.held or may_hold)
-
     def drop_sentence(self, file: ExperimentFile) -> str:
         """Return which step lets go of what the fingers hold now, or may hold; empty if none does."""
         gripper, held = self.inputs.gripper, self.tool.any_object
@@ -182,17 +145,6 @@ class OperatorView:
             return ""
         number, step = first
         return f"step {number} ({step.do}) opens the gripper, and a tool in it drops; {held}"
-
-    def known_at_start(self) -> KnownTool:
-        """Return the known angle and torque of the tool at a start."""
-        return known_at_start(loaded=self.tool.may_be_loaded(), twisted_rad=self.tool.twisted_rad)
-
-    def clamped_turn(self) -> str:
-        """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""
-        arm, origin_rad = self.inputs.arm, self.tool.grip.origin_rad
-        if arm is None or origin_rad is None:
-            return ""
-        return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""

@@ -15,8 +15,8 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.operator_questions import question_of
 from shearloop.daemon.sensing.sessions import torque_sources
-from shearloop.daemon.start_question import question_of
 from shearloop.drivers.ur.settings import UrLimits, read_settings
 from tests.daemon.control.loop_rig import CONFIG, TICK_S, Rig, new_loop, phase, started
 from tests.fixtures.daemons import collector, running_daemon, shearloop

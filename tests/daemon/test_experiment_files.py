@@ -13,11 +13,11 @@ import pytest
 import yaml
 
 from shearloop.cli import command, main
-from shearloop.daemon import experiment_files, start_question
+from shearloop.daemon import experiment_files, operator_questions
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
-from shearloop.daemon.control.known_tool import AT_REST
+from shearloop.daemon.control.grip import NO_GRIP, Grip
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -261,12 +261,20 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
             runs=1,
             safety=SimpleNamespace(acknowledgements=0),
             operator=SimpleNamespace(
+                inputs=SimpleNamespace(gripper=None),
                 tool=SimpleNamespace(
-                    has_gripper=True, may_hold=lambda: False, activates=False, held=None, unknown_grip=""
+                    has_gripper=True,
+                    may_hold=lambda: False,
+                    may_be_loaded=lambda: False,
+                    activates=False,
+                    held=None,
+                    unknown_grip="",
+                    twisted_rad=0.0,
+                    grip=NO_GRIP,
                 ),
                 drop_sentence=lambda _: "",
-                file_refusal=lambda _: None,
-                known_at_start=lambda: AT_REST,
+                why_no_source=lambda _: None,
+                why_not_with_tool=lambda _: None,
             ),
         ),
         runner,
@@ -423,14 +431,14 @@ async def test_what_a_person_confirmed_is_what_starts(folder, monkeypatch):
     assert runner.started == []
     await start({"experiment": str(path), "digest": refused.value.facts["digest"]})
     path.write_bytes(before)
-    monkeypatch.setattr(start_question, "activation_note", lambda *_: " Before step 1 the gripper is activated.")
+    monkeypatch.setattr(operator_questions, "activation_note", lambda *_: " Before step 1 the gripper is activated.")
     with pytest.raises(CommandRefusedError, match="the effect of its start on a held tool has changed"):
         await start({"experiment": str(path), "digest": asked["digest"]})
     monkeypatch.undo()
     operator = subject.control_loop.operator
-    operator.tool.may_hold, operator.release_stakes = lambda: True, lambda: ("held", "one tool")
+    operator.tool.may_hold, operator.tool.grip = lambda: True, Grip(0.3, 20.0)
     asked_again = await start({"experiment": str(path), "ask": True})
-    operator.release_stakes = lambda: ("held", "another tool")
+    operator.tool.grip = Grip(0.6, 20.0)
     with pytest.raises(CommandRefusedError, match="a held tool"):
         await start({"experiment": str(path), "digest": asked_again["digest"]})
     operator.tool.may_hold = lambda: False

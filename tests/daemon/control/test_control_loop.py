@@ -18,6 +18,7 @@ from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.torque_controller import ControllerReason
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.operator_questions import file_refusal, release_question
 from shearloop.daemon.torques import TorqueSample, beyond_noise
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, speed_of, started, stop
 
@@ -335,7 +336,7 @@ def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_i
     started(rig, GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
     assert phase(rig) is ExperimentPhase.RUNNING
-    assert "30.0 mm wide, with at most 60 N" in rig.control_loop.operator.release_question()
+    assert "30.0 mm wide, with at most 60 N" in release_question(rig.control_loop.operator)
     rig.hand, rig.force_n, rig.width_mm = replace(rig.hand, others_requests=2, **sense), force_n, 19.7
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
@@ -344,7 +345,7 @@ def test_a_gripper_that_another_program_commands_stops_the_twist_and_says_what_i
     rig.step()
     codes = [fault.code for fault in rig.control_loop.status.decision.reported]
     assert (FaultCode.TOOL_GRIPPED in codes) is note
-    question = rig.control_loop.operator.release_question()
+    question = release_question(rig.control_loop.operator)
     assert ("hold something 19.7 mm wide, with an unknown force" in question) is note
     assert ("the gripper reports no object" in question) is not note
 
@@ -842,7 +843,7 @@ def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
 
     def refusal(*steps: dict[str, Any]) -> str:
         content = {"name": "one", "torque_source": "right", "steps": list(steps)}
-        return rig.control_loop.operator.file_refusal(ExperimentFile.model_validate(content)) or ""
+        return file_refusal(rig.control_loop.operator, ExperimentFile.model_validate(content)) or ""
 
     wide = {**GRIP, "width_mm": 35.0}
     assert "step 1 (grip) to 35 mm would open them and drop it: put a `release` before" in refusal(wide)
@@ -855,9 +856,9 @@ def test_a_gripper_that_is_too_hot_says_what_a_release_does_and_grips_nothing():
     rig = Rig(new_loop())
     rig.hand, rig.force_n = replace(rig.hand, too_hot=True), 60.0
     rig.run(0.6)
-    assert "it is activated first: the fingers open and close once" in rig.control_loop.operator.release_question()
+    assert "it is activated first: the fingers open and close once" in release_question(rig.control_loop.operator)
     file = ExperimentFile.model_validate({"name": "one", "torque_source": "right", "steps": [GRIP]})
-    assert "too hot for step 1 (grip): let it cool down" in (rig.control_loop.operator.file_refusal(file) or "")
+    assert "too hot for step 1 (grip): let it cool down" in (file_refusal(rig.control_loop.operator, file) or "")
 
 
 def test_torques_within_the_noise_of_their_source_are_no_loads():

@@ -14,8 +14,8 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.operator_questions import held_note, release_question, start_of
 from shearloop.daemon.rig_memory import read_memories
-from shearloop.daemon.start_question import held_note
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
@@ -154,8 +154,8 @@ def test_the_angle_of_a_clamped_tool_goes_on_from_start_to_start_until_another_o
     assert "`shearloop command release --yes` lets it count from 0" in rig.control_loop.experiment.stop_reason
     rig.control_loop.acknowledge()
     assert rig.control_loop.operator.release_refusal() is None
-    assert (
-        "nothing opens, because no gripper is configured; the angle of" in rig.control_loop.operator.release_question()
+    assert "nothing opens, because no gripper is configured; the angle of" in release_question(
+        rig.control_loop.operator
     )
     rig.control_loop.tool.on_release_ended()
     assert held_note(rig.control_loop.operator, file) == ""
@@ -365,8 +365,8 @@ def test_the_plan_before_a_start_assumes_nothing_of_a_tool_that_is_turned(rig):
     ready = rig()
     file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "twist", "angles_rad": [0.1]}]})
     if rig is clamped_rig:
-        before = plan_of(file, start=ready.control_loop.operator.known_at_start())
+        before = plan_of(file, start=start_of(ready.control_loop.operator))
         assert (before.steps[0].direction, before.assumed) == ("counterclockwise", "")
         started(ready, TWIST_AGAIN, **TWISTED).run(20)
-    plan = plan_of(file, start=ready.control_loop.operator.known_at_start())
+    plan = plan_of(file, start=start_of(ready.control_loop.operator))
     assert (plan.steps[0].way_unknown, plan.steps[0].direction, plan.assumed) == (True, "", "")

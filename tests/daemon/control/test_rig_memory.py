@@ -21,8 +21,8 @@ from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import FOLLOWED_MM, NO_GRIP, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.operator_questions import activation_note, release_question
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
-from shearloop.daemon.start_question import activation_note
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.command_handler import BEING_MADE_READY
@@ -161,9 +161,8 @@ def test_the_force_of_a_grip_is_remembered_while_the_fingers_close():
     # The process is killed, and the fingers close all the same.
     rig.force_n = 60.0
     after = after_restart(rig)
-    assert (
-        "with at most 60 N unless it was gripped again before this daemon began"
-        in after.control_loop.operator.release_question()
+    assert "with at most 60 N unless it was gripped again before this daemon began" in release_question(
+        after.control_loop.operator
     )
 
 
@@ -293,7 +292,7 @@ def test_a_grip_that_changed_while_no_daemon_ran_is_one_that_nobody_knows(how, r
     (warning,) = (line for line in logged if line["log_level"] == "warning")
     assert "does not have the grip of the last daemon" in warning["event"]
     if rig.force_n:
-        assert "with an unknown force" in rig.control_loop.operator.release_question()
+        assert "with an unknown force" in release_question(rig.control_loop.operator)
         assert FaultCode.GRIP_UNKNOWN.value.kind in restarted.told
     else:
         assert FaultCode.GRIP_UNKNOWN.value.kind not in restarted.told
@@ -377,7 +376,7 @@ def test_the_operator_is_warned_before_a_gripper_that_lost_its_power_is_activate
         assert refused is None
     else:
         assert "release --yes`, or put a `release` before it" in refused
-    assert "it is activated first" in rig.control_loop.operator.release_question()
+    assert "it is activated first" in release_question(rig.control_loop.operator)
 
 
 def test_a_tool_that_was_exchanged_while_the_gripper_was_away_is_another_one(restarted):

@@ -25,10 +25,10 @@ from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.stop_client import nothing_moved
+from shearloop.daemon.operator_questions import held_note, release_question
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
-from shearloop.daemon.start_question import held_note
 from shearloop.daemon.torques import LARGEST_DRIFT_NM, WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import MODELS
@@ -72,9 +72,8 @@ async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befal
         if befalls is not None:
             befalls(cell)
         await cell.cycles(10)
-        assert (
-            "its fingers hold something 30.0 mm wide, with an unknown force"
-            in cell.control_loop.operator.release_question()
+        assert "its fingers hold something 30.0 mm wide, with an unknown force" in release_question(
+            cell.control_loop.operator
         )
         assert await released(cell) is None
         assert cell.gripper.asked == ["open"]

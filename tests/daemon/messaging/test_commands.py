@@ -15,6 +15,7 @@ import zmq.asyncio
 from shearloop.cli.command import DAEMON_COMMANDS, OPTIONS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import ARGUMENTS, Answered, Commands
+from shearloop.daemon.control.grip import NO_GRIP
 from shearloop.daemon.messaging.bound_requests import LateRequestError, meant_for
 from shearloop.daemon.messaging.callers import UNKNOWN, caller, caller_of
 from shearloop.daemon.messaging.client import ask, receive_messages, send_command
@@ -293,7 +294,8 @@ async def test_a_command_that_crashes_or_is_cut_off_is_reported_as_not_carried_o
             begun.set()
             await never.wait()
 
-    operator = SimpleNamespace(release_question=lambda: "the fingers open", release_stakes=tuple)
+    no_gripper = SimpleNamespace(has_gripper=False, held=None, activates=False, grip=NO_GRIP)
+    operator = SimpleNamespace(tool=no_gripper, inputs=SimpleNamespace(arm=None, gripper=None))
     loop = SimpleNamespace(operator=operator, pause=crash)
     rig = SimpleNamespace(runner=Runner(), control_loop=loop, occasion=tuple, memory=NoMemory())
     handlers = bound_handlers(

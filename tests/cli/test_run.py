@@ -263,7 +263,7 @@ async def test_a_configured_experiment_waits_for_the_operator(waiting_config, lo
     begun: list[Path] = []
     answered = asyncio.Event()
 
-    async def start(path: Path, *_: object) -> str | None:
+    async def start(path: Path, *_: object, confirmed: bool) -> str | None:  # noqa: ARG001 - autostart confirms
         begun.append(path)
         return None
 
@@ -291,7 +291,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
     """Neither by the same one again, nor by the configured one after another."""
     ready, begun = asyncio.Event(), []
 
-    async def start(path: Path, *_: object) -> str | None:
+    async def start(path: Path, *_: object, confirmed: bool) -> str | None:  # noqa: ARG001 - autostart confirms
         if not ready.is_set():
             return "the gripper is not ready"
         begun.append(path)
@@ -337,7 +337,8 @@ async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(
     """An experiment file may be spoilt when it is to begin, and mended after somebody has said stop."""
     begun = []
 
-    async def begin(path: Path) -> str | None:
+    async def begin(path: Path, *, confirmed: bool) -> str | None:
+        assert confirmed, "it starts by itself on emulated rigs alone"
         if begun:
             return None
         begun.append(path)

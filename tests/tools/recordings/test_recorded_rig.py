@@ -69,7 +69,7 @@ async def test_a_full_disk_refuses_only_the_next_experiment(recorded_rig, tiny_b
         assert "No space left on device" in refused["reason"]
         filler.unlink()
         unwritten = FaultCode.RECORDING_FAILED.value.kind
-        while unwritten in (reply := await command("start", experiment=path)).get("reason", ""):
+        while unwritten in (reply := await command("start", experiment=path, confirmed=True)).get("reason", ""):
             # It is tried again three times a second.
             heard = len(watcher.seen["health"])
             await watcher.until("health", lambda health, heard=heard: health["seq"] >= heard)

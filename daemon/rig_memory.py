@@ -218,11 +218,9 @@ class RigMemory:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self.wrench.watch()
         state = Remembered.of(self.loop)
-        if state.stop and not self._stop_waits:
-            self._stopped_s = time.time()
-        self._stop_waits = bool(state.stop)
-        stopped_s = self._stopped_s if state.stop else None
-        state = replace(state, running=state.running or self._starting, stopped_s=stopped_s)
+        stopped_s = self._stopped_s if self._stop_waits else time.time()
+        self._stop_waits, self._stopped_s = bool(state.stop), stopped_s if state.stop else None
+        state = replace(state, running=state.running or self._starting, stopped_s=self._stopped_s)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
             state = replace(state, load_zero=calibration.tare_counts, load_nm_per_count=calibration.nm_per_count)

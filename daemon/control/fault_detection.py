@@ -242,6 +242,11 @@ def _device_faults(inputs: LatestInputs, watched: Watched, step: RunningStep | N
     if awaited:
         waits = (f"{name}, {lost[name].removesuffix('.')}" if name in lost else name for name in awaited)
         found.append(Fault(FaultCode.DEVICE_AWAITED, "; ".join(waits)))
+    # Before the last states of a lost device.
+    for name, reason in lost.items():
+        if name in watched.required and name not in awaited:
+            gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")
+            found.append(Fault(*gone))
     if arm is not None:
         if t_ns - arm.t_ns > watched.patience * ARM_STALE_S * 1e9:
             stale = f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago"
@@ -251,17 +256,12 @@ def _device_faults(inputs: LatestInputs, watched: Watched, step: RunningStep | N
         elif arm.protective_stop:
             found.append(Fault(FaultCode.PROTECTIVE_STOP, arm.blocked or "the controller reports it", t_ns=arm.t_ns))
         elif arm.blocked and arm.starting:
-            starting = "safety, power and control program are made ready"
-            found.append(Fault(FaultCode.ROBOT_STARTING, starting, t_ns=arm.t_ns))
+            found.append(Fault(FaultCode.ROBOT_STARTING, arm.blocked, t_ns=arm.t_ns))
         elif arm.blocked:
             code = FaultCode.ROBOT_UNCONTROLLED if arm.late else FaultCode.ROBOT_BLOCKED
             found.append(Fault(code, arm.blocked, t_ns=arm.t_ns))
     if gripper is not None and has_gripper:
         found += _gripper_faults(gripper, step, watched.patience, t_ns)
-    for name, reason in lost.items():
-        if name in watched.required and name not in awaited:
-            gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")
-            found.append(Fault(*gone))
     return found
 
 

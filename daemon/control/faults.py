@@ -294,8 +294,7 @@ class FaultCode(Enum):
 
 
 TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
-# The cure of a fault that is over.
-_UNLOCK = "Look at the rig, then send `shearloop command unlock`."
+_CURE_OF_THE_PAST = "Look at the rig, then send `shearloop command unlock`."
 # The longest hold by several alternating faults.
 LONGEST_HOLD_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
@@ -331,4 +330,4 @@ class Fault:
     @property
     def sentence(self) -> str:
         """The operator's sentence, with the cure."""
-        return f"{self.cause}. {_UNLOCK if self.is_over else self.rule.cure}"
+        return f"{self.cause}. {_CURE_OF_THE_PAST if self.is_over else self.rule.cure}"

@@ -9,12 +9,10 @@ from shearloop.daemon.control.faults import LONGEST_HOLD_S, TABLE, Fault, FaultC
 # time becomes a stop.
 DECAY = 0.5
 # Robot and gripper show these at rest too, as long as they last, unless another fault of a device hides them.
-_SHOWN_AT_REST = {FaultCode.ROBOT_BLOCKED, FaultCode.PROTECTIVE_STOP, FaultCode.EMERGENCY_STOP, FaultCode.GRIPPER_FAULT}
-_OF_DEVICES = (
-    _SHOWN_AT_REST
-    | {FaultCode.ROBOT_LOST, FaultCode.DEVICE_LOST, FaultCode.STATE_STALE}
-    | {FaultCode.DEVICE_AWAITED, FaultCode.ROBOT_STARTING, FaultCode.ROBOT_UNCONTROLLED}
-)
+_STOPS = {FaultCode.PROTECTIVE_STOP, FaultCode.EMERGENCY_STOP, FaultCode.GRIPPER_FAULT}
+_SHOWN_AT_REST = _STOPS | {FaultCode.ROBOT_BLOCKED, FaultCode.ROBOT_UNCONTROLLED}
+_LOSSES = {FaultCode.ROBOT_LOST, FaultCode.DEVICE_LOST, FaultCode.STATE_STALE, FaultCode.DEVICE_AWAITED}
+_OF_DEVICES = _SHOWN_AT_REST | _LOSSES | {FaultCode.ROBOT_STARTING}
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,13 +176,15 @@ class SafetyMonitor:
         codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.
         known = {fault.code for fault in stop.faults}
-        over = set() if codes & _OF_DEVICES else _SHOWN_AT_REST
+        # What a present fault of a device hides comes after it, and else it is over.
+        over, hidden = (set(), _SHOWN_AT_REST - codes) if codes & _OF_DEVICES else (_SHOWN_AT_REST, set())
         kept = [replace(one, is_over=one.code in over) for one in stop.faults if one.code not in codes]
         kept += [fault for fault in active if fault.code in known]
         order = list(dict.fromkeys(fault.code for fault in stop.faults))
         kept.sort(key=lambda fault: order.index(fault.code))
         new = (fault for fault in active if fault.code not in known)
-        return SafetyDecision(stop.response, cls._explained((*kept, *new), _explaining(stop.faults)))
+        told = sorted((*kept, *new), key=lambda fault: fault.code in hidden)
+        return SafetyDecision(stop.response, cls._explained(tuple(told), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:
         """Advance the hold timers to t_ns: up for faults that lasted until now, down for the others."""

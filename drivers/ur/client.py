@@ -12,6 +12,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine
+from dataclasses import replace
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, TypeAlias, cast
@@ -94,6 +95,8 @@ class UrRobot:
         self._replies: dict[int, asyncio.Future[messages.CommandReply]] = {}
         self._number = 0
         self._warning = ""
+        # Why the last worker ended, if the control program did not start, until one plays.
+        self._not_starting = ""
         # Tasks that wait for the next state, in the order of their calls: who waits first decides first.
         self._waiting: list[asyncio.Future[messages.RobotState]] = []
 
@@ -175,6 +178,7 @@ class UrRobot:
                 await self._run_worker()
             except RobotLostError as loss:
                 self.losses[loss.kind] += 1
+                self._not_starting = str(loss) if loss.kind == "script" else ""
                 pause_s = self.monitor.failed(loss, time.monotonic_ns())
                 await asyncio.sleep(math.inf if loss.kind in LASTING else pause_s)
 
@@ -185,23 +189,28 @@ class UrRobot:
         self._told_held = self._holds()
         connection.send(messages.Held(self._told_held, self._wrench_zero))
         self._connection = connection
+        reason = "The robot's worker ended before it answered; nothing is sent again."
         try:
             await connection.listen()
+        except RobotLostError as loss:
+            reason = f"{loss} Nothing is sent again."
+            raise
         finally:
-            self._disconnect()
+            self._disconnect(reason)
             await _finish(connection.end())
 
-    def _disconnect(self) -> None:
+    def _disconnect(self, reason: str) -> None:
         self._connection = None
         self.state = self.rests_since_ns = None
-        unanswered = messages.CommandReply("The robot's worker ended before it answered; nothing is sent again.")
         for number in list(self._replies):
-            self.handle_message(number, unanswered)
+            self.handle_message(number, messages.CommandReply(reason))
 
     def handle_message(self, number: int, message: messages.Message) -> None:
         """Handle a message of the worker."""
         match message:
             case messages.RobotState():
+                if message.recovering and self._not_starting:
+                    message = replace(message, blocked=self._not_starting)
                 before, self.state = self.state, message
                 self.rests_since_ns = (self.rests_since_ns or message.measured_ns) if message.rests else None
                 self._wrench_zero = message.wrench_zero

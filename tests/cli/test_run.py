@@ -316,7 +316,7 @@ async def test_a_manual_start_cancels_the_waiting_experiment(own, finished, wait
 async def test_a_manually_started_experiment_is_followed_to_its_end(autostart, tmp_path):
     path = tmp_path / "experiment.yaml"
 
-    async def not_yet(_path: Path) -> str | None:
+    async def not_yet(_path: Path, *, confirmed: bool) -> str | None:  # noqa: ARG001 - autostart confirms
         experiment.call_off()
         return "the gripper is not ready"
 

@@ -45,6 +45,27 @@ async def test_a_protective_stop_ends_the_experiment_and_the_operator_unlocks_it
         assert not daemon.supervisor.records["loop"].restarts
 
 
+async def test_a_program_that_does_not_start_is_named_by_answer_and_state(rig_config, tiny_bank, tmp_path):
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
+        await started(watcher, command, experiment(tmp_path, SLOW_TWIST))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        fault("drop-scripts")
+        fault("stop")
+        await watcher.until("loop.state", lambda state: "stopped at the pendant" in state["cause"])
+        # A worker gives up after some seconds; what is sent while a new one begins is refused at once.
+        while "does not play it" not in (reply := await command("unlock"))["reason"]:
+            await watcher.next("health", watcher.count("health"))
+        assert reply["reason"].startswith("The controller took the control program and does not play it: look at the")
+        for code in (FaultCode.ROBOT_LOST, FaultCode.ROBOT_STARTING):
+            since = watcher.count("loop.state")
+            state = await watcher.until("loop.state", lambda state, code=code: code.text in state["faults"], since)
+            assert "does not play it" in state["cause"]
+            assert "stopped at the pendant" in state["reasons"], "what stopped it before is known too"
+        fault("normal")
+        while not (reply := await command("unlock"))["ok"]:
+            await watcher.next("health", watcher.count("health"))
+
+
 async def test_an_unlock_after_a_fault_of_the_gripper_asks_before_it_drops_the_tool(rig_config, tiny_bank, tmp_path):
     async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
         await started(watcher, command, experiment(tmp_path, SLOW_TWIST))

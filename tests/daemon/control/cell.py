@@ -80,7 +80,7 @@ class Robot(UrRobot):
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
         held, self._held, self._unread = self._held, [], []
-        self._disconnect()
+        self._disconnect("The worker ended.")
         for replied, _ in held:
             replied.set_result(CommandReply("The worker ended before it answered."))
 

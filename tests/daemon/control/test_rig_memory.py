@@ -143,14 +143,16 @@ def test_a_cause_that_is_over_is_told_so_and_what_is_wrong_now_beside_it():
         f"over by now: the robot does not move: {SLIDER} Look at the rig, then send `shearloop command unlock`. "
         "Also: the recording cannot be written: the disk is full."
     )
-    # The emergency stop is all that the robot says then.
+    # What is wrong now comes first, and it is all that the robot says: nobody knows whether the slider is back.
     rig.arm = replace(rig.arm, emergency_stop=True)
     rig.step()
-    assert refusal(rig).startswith("the robot does not move: The speed slider")
+    assert refusal(rig).startswith(FaultCode.EMERGENCY_STOP.value.kind)
+    assert "; the robot does not move: The speed slider" in refusal(rig)
     rig.silent.add("arm")
     for _ in range(100):
         rig.step()
-    assert refusal(rig).startswith("the robot does not move: The speed slider"), "nobody knows whether it is over"
+    assert refusal(rig).startswith(FaultCode.STATE_STALE.value.kind)
+    assert "over by now" not in refusal(rig)
 
 
 def test_the_force_of_a_grip_is_remembered_while_the_fingers_close():

@@ -22,12 +22,11 @@ import structlog
 
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_check import experiment_mistakes, tool_note
+from shearloop.daemon.control.experiment_check import experiment_mistakes
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.torques import TorqueSource
-from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.errors import UserError
 from shearloop.files import read_file
 from shearloop.timeouts import timeout
@@ -134,15 +133,6 @@ class ExperimentFiles:
     _listed: dict[Path, _Listed] = field(default_factory=dict, init=False)
     # The latest complete list.
     _latest: Mapping[str, str] | None = field(default=None, init=False)
-
-    @property
-    def gripper(self) -> GripperModel | None:
-        """The rig's gripper, if one is known."""
-        return self.config.gripper_model
-
-    def tool_note(self, file: ExperimentFile) -> str:
-        """Return what the driving torque rests on that nothing will check about the tool; empty without anything."""
-        return tool_note(file, self.config, self.sources, self.robot)
 
     async def read(self, path: Path) -> ReadExperiment:
         """Return the experiment of a file; raises UserError without the file's content, at the latest after 5 s."""

@@ -7,6 +7,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.known_tool import KnownTool, known_at_start
 from shearloop.daemon.control.operator_view import OperatorView, activation_sentence
 from shearloop.daemon.control.plan import plan_of
+from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.control.step_motions import first_grip, first_gripper_step, first_motion_before_grip
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
 from shearloop.daemon.questions import Question, digest_of
@@ -22,11 +23,11 @@ def question_of(
     file = experiment.file
     limits = files.robot.settings.limits if files.robot is not None else None
     start, loop = start_of(operator), files.config.loop
-    plan = plan_of(file, limits, files.gripper, warm_up_s=warm_up_s, start=start, loop=loop)
+    plan = plan_of(file, limits, files.config.gripper_model, warm_up_s=warm_up_s, start=start, loop=loop)
     motion, note = plan.first_motion, activation_note(operator, file)
     text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-    if tool_note := files.tool_note(file):
-        sentences = (*sentences, f"  {tool_note}")
+    if rests_on := tool_note(file, files.config, files.sources, files.robot):
+        sentences = (*sentences, f"  {rests_on}")
     held = release_stakes(operator) if operator.tool.may_hold() else ()
     # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
     digest = digest_of(experiment.data, text, *sentences, *occasion, *held)

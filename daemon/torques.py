@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 if TYPE_CHECKING:
+    from shearloop.daemon.reach import Reach
+
     # A rig without a fingertip does not load it.
     from shearloop.estimation import Calibration
 
@@ -85,6 +87,8 @@ class TorqueSource:
     only_sign: int = 0
     calibration: "Calibration | None" = None
     min_fresh_s: float = 0.0
+    # Of a source without a `calibration`, where it is known.
+    reach: "Reach | None" = None
 
     @property
     def fresh_s(self) -> float:

@@ -46,10 +46,16 @@ class ValueRange:
         """Return the range of values larger by a factor."""
         return ValueRange(factor * self.low, factor * self.high)
 
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The smallest and the largest value that is not too far beyond the calibrated ones."""
+        beyond = _LARGEST_BEYOND * (self.high - self.low)
+        return self.low - beyond, self.high + beyond
+
     def reasons(self, value: float, quantity: str, unit: str) -> tuple[str, ...]:
         """Return the reason against a value far beyond the range, if there is one."""
-        beyond = _LARGEST_BEYOND * (self.high - self.low)
-        if self.low - beyond <= value <= self.high + beyond:
+        low, high = self.ends
+        if low <= value <= high:
             return ()
         return (
             f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to {self.high:.3g} "

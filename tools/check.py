@@ -111,7 +111,8 @@ def _check_experiment(
     config: "DaemonConfig", parts: Parts, sources: Mapping[str, "TorqueSource"], robot: "Commissioning | None"
 ) -> None:
     """Add the plan of the configured experiment, its mistakes, and what drives it."""
-    from shearloop.daemon.control.experiment_check import experiment_mistakes, tool_note
+    from shearloop.daemon.control.experiment_check import experiment_mistakes
+    from shearloop.daemon.control.sensor_reach import tool_note
     from shearloop.daemon.experiment_files import check_experiment, read_document
     from shearloop.daemon.torques import WRENCH
 

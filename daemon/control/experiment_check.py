@@ -225,6 +225,10 @@ def experiment_mistakes(
             for number, step in enumerate(file.steps)
             if isinstance(step, GripperStep)
         ]
+    # Only an experiment that is read needs it.
+    from shearloop.daemon.control.sensor_reach import beyond_reach
+
+    mistakes += [(("steps", number), why) for number, why in beyond_reach(file, sources)]
     wrong = _wrong_tools(file, sources, known=knows_tool(file.tool_mm, config, robot))
     place = "torque_source" if file.tool_mm is None else "tool_mm"
     mistakes += [((place,), why) for why in wrong]
@@ -251,16 +255,6 @@ def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, k
                     f"{name}, which supervises, has no torque on this tool: {error}, or leave out its `calibration`; "
                     "its frames are recorded without one too"
                 )
-
-
-def tool_note(
-    file: ExperimentFile, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None
-) -> str:
-    """Return what the driving torque rests on that nothing will check about the tool; empty without anything."""
-    driving = sources.get(file.torque_source)
-    if driving is None or driving.calibration is None:
-        return ""
-    return driving.calibration.tool_note(driving.name, tool_known=knows_tool(file.tool_mm, config, robot))
 
 
 def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[Mistake]:

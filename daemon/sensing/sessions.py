@@ -121,9 +121,12 @@ def torque_sources(
         if (skin := skin_torque_source(config.skin)) is not None:
             sources[skin.name] = skin
     if config.load_cell is not None:
-        cell = config.load_cell
+        from shearloop.daemon.reach import Reach
+        from shearloop.drivers.load_cell import CAPACITY_NM
+
+        cell, reach = config.load_cell, Reach(-CAPACITY_NM, CAPACITY_NM, "this is its capacity; ask for less")
         sources[LOAD_CELL] = TorqueSource(
-            name=LOAD_CELL, period_s=1.0 / cell.rate_hz, needs_zero=True, only_sign=cell.only_sign
+            name=LOAD_CELL, period_s=1.0 / cell.rate_hz, needs_zero=True, only_sign=cell.only_sign, reach=reach
         )
     return sources
 

@@ -7,11 +7,13 @@ from types import MappingProxyType
 
 import structlog
 
+from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.messages import SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.reach import Reach
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import SensorListener, TorqueSample, TorqueSource
@@ -230,7 +232,27 @@ def skin_torque_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
     if config.tool_radius_mm is None:
         return None
-    return TorqueSource(name=SKIN, period_s=config.daq.sample_period_s, has_friction_band=True)
+    return TorqueSource(name=SKIN, period_s=config.daq.sample_period_s, has_friction_band=True, reach=_reach(config))
+
+
+def _reach(config: SkinConfig) -> Reach | None:
+    """Return the torques within the calibrated curve; None without a radius, or if the calibration cannot be read."""
+    radius_m = tool_radius_m(config)
+    try:
+        calibration = load_calibration(config.calibration)
+    except CalibrationError:
+        # The skin's task, and its part of `check`, name the mistake.
+        return None
+    if radius_m is None:
+        return None
+    # What friction hides is not in the tension.
+    hidden_n = 0.5 * friction_band_n(config, calibration)
+    low_n, high_n = calibration.tension_n[0] - hidden_n, calibration.tension_n[-1] + hidden_n
+    why = (
+        f"it is calibrated from {calibration.tension_n[0]:+.1f} to {calibration.tension_n[-1]:+.1f} N, and its radius "
+    )
+    why += f"is {1e3 * radius_m:g} mm; ask for less, or calibrate it further"
+    return Reach(low_n * radius_m, high_n * radius_m, why)
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:

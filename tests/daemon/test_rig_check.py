@@ -13,8 +13,10 @@ import yaml
 
 from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings
 from shearloop.errors import UserError
@@ -187,6 +189,62 @@ def of_tool(tool_mm: float) -> TorqueSource:
 
 
 CELL = {"load_cell": {"device": {"path": "load"}}}
+CONFIGS = Path(__file__).parents[2] / "config"
+SKIN = yaml.safe_load((CONFIGS / "skin_demo.yaml").read_text(encoding="utf-8"))["skin"]
+SKIN = {**SKIN, "calibration": str(CONFIGS / SKIN["calibration"]), "tool_radius_mm": 15}
+
+
+@pytest.mark.parametrize("driving", ["load_cell", "skin"])
+@pytest.mark.parametrize(
+    ("step", "refused"),
+    [
+        ({"do": "hold_torque", "torque_nm": 0.12}, "hold_torque asks for +0.12 N·m"),
+        ({"do": "hold_torque", "torque_nm": 0.12, "direction": "clockwise"}, "hold_torque asks for -0.12 N·m"),
+        ({"do": "hold_torque", "torque_nm": 0.07}, ""),
+        (
+            {"do": "tighten", "until_torque_nm": 0.12, "until_angle_rad": 0.3, "direction": "clockwise"},
+            "tighten asks for -0.12 N·m",
+        ),
+        ({"do": "tighten", "until_torque_nm": 0.07, "until_angle_rad": 0.3, "direction": "clockwise"}, ""),
+    ],
+)
+async def test_a_torque_beyond_what_the_skin_is_calibrated_for_is_refused(tmp_path, driving, step, refused):
+    """Also where it only supervises: it holds the wrist as soon as it has no torque."""
+    daemon = config(tmp_path, {"torque_source": driving, "steps": [IDENTIFY, step]}, skin=SKIN, **CELL)
+    sources = torque_sources(daemon, {}, None)
+    files = ExperimentFiles((tmp_path,), daemon, sources, None, LoadedFiles(()))
+    if not refused:
+        assert check_experiment(daemon, sources) is not None
+        assert await files.read(daemon.experiment)
+        return
+    role = ", which supervises," if driving == "load_cell" else ""
+    said = f"steps[1]: {refused}, and skin{role} measures -0.0782 to +0.0782 N·m: it is calibrated from -5.2 to"
+    with pytest.raises(UserError, match=re.escape(said)):
+        check_experiment(daemon, sources)
+    with pytest.raises(UserError, match=re.escape(said)):
+        await files.read(daemon.experiment)
+
+
+@pytest.mark.parametrize("driving", ["load_cell", "right"])
+def test_a_torque_beyond_a_fingertips_calibration_or_the_load_cells_capacity_is_refused(tmp_path, driving):
+    def said(torque_nm: float) -> str:
+        steps = [IDENTIFY, {"do": "hold_torque", "torque_nm": torque_nm}]
+        content = {"torque_source": driving, "tool_mm": 20, "limits": {"torque_nm": 5}, "steps": steps}
+        daemon = config(tmp_path, content, **CELL)
+        sources = {"right": of_tool(20.0), **torque_sources(daemon, {}, None)}
+        try:
+            check_experiment(daemon, sources)
+        except UserError as error:
+            return str(error)
+        return ""
+
+    # It is calibrated from 0.09 to 0.21 N·m, and reads a third of this range beyond either end.
+    assert said(0.2) == ""
+    role = "" if driving == "right" else ", which supervises,"
+    assert f"hold_torque asks for +0.3 N·m, and right{role} measures +0.048 to +0.252 N·m: ask for less" in said(0.3)
+    assert "measures -1.75 to +1.75 N·m: this is its capacity" in said(2.0)
+
+
 TURN = [{"do": "turn_to", "angle_rad": 0.1}]
 
 
@@ -228,7 +286,7 @@ def test_a_plan_says_that_nothing_will_know_the_tool(tmp_path, content, gripper,
     daemon = config(tmp_path, {"torque_source": "right", **content}, **CELL, **gripper)
     sources = {"right": of_tool(20.0), **LOAD}
     file = check_experiment(daemon, sources)
-    note = ExperimentFiles((tmp_path,), daemon, sources, None, LoadedFiles(())).tool_note(file)
+    note = tool_note(file, daemon, sources, None)
     assert said in note
     assert bool(note) is bool(said)
 

@@ -181,7 +181,9 @@ class Commands:
         rig = required_rig(self.rig)
         try:
             if request.get("ask"):
-                question = await rig.start_question(Path(path))
+                from shearloop.daemon.operator_questions import start_question
+
+                question = await start_question(rig, Path(path))
                 return dict(question.facts)
             digest, confirmed = request.get("digest"), bool(request.get("confirmed"))
             _refuse_if(await rig.start(Path(path), digest, self._deadline(request), confirmed=confirmed))

@@ -3,6 +3,9 @@
 Nothing moves while somebody asks, so their modules are loaded then.
 """
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.known_tool import KnownTool, known_at_start
 from shearloop.daemon.control.operator_view import OperatorView, activation_sentence
@@ -11,6 +14,20 @@ from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.control.step_motions import first_grip, first_gripper_step, first_motion_before_grip
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
 from shearloop.daemon.questions import Question, digest_of
+from shearloop.errors import UserError
+
+if TYPE_CHECKING:
+    from shearloop.daemon.rig import Rig
+
+
+async def start_question(rig: "Rig", path: Path) -> Question:
+    """Return the question before a start, with the first motion, and the plan; raises UserError as `Rig.start` does."""
+    if (reason := rig.start_refusal()) is not None:
+        raise UserError(reason)
+    experiment = await rig.experiments.read(path)
+    if (reason := file_refusal(rig.control_loop.operator, experiment.file)) is not None:
+        raise UserError(reason)
+    return rig.question_of(experiment)
 
 
 def question_of(

@@ -265,7 +265,7 @@ class Rig:
     async def _start(self, path: Path, digest: str | None, deadline: Deadline, *, confirmed: bool) -> str | None:
         stops_before = self.runner.stop_count
         experiment = await self.experiments.read(path)
-        if digest is not None and digest != (question := self._question_of(experiment)).digest:
+        if digest is not None and digest != (question := self.question_of(experiment)).digest:
             changed = (
                 "since its plan was shown, the file or the effect of its start on a held tool has changed, or "
                 "something was stopped or run"
@@ -283,19 +283,8 @@ class Rig:
             self.recorder.record_experiment(experiment.file.name, path, experiment.data, experiment.file.tool_mm)
         return reason
 
-    async def start_question(self, path: Path) -> Question:
-        """Return the question before a start, with the first motion, and the plan; raises UserError as `start` does."""
-        if (reason := self.start_refusal()) is not None:
-            raise UserError(reason)
-        from shearloop.daemon.operator_questions import file_refusal
-
-        experiment = await self.experiments.read(path)
-        if (reason := file_refusal(self.control_loop.operator, experiment.file)) is not None:
-            raise UserError(reason)
-        return self._question_of(experiment)
-
-    def _question_of(self, experiment: ReadExperiment) -> Question:
-        # Nothing runs while somebody asks, and nothing else needs its modules.
+    def question_of(self, experiment: ReadExperiment) -> Question:
+        """Return the question before an experiment, while nothing runs: only then its modules are loaded."""
         from shearloop.daemon.operator_questions import question_of
 
         loop = self.control_loop

@@ -86,8 +86,8 @@ class Remembered:
             # A stored stop has details that the earlier process has joined.
             if not any(detail in one for one in of_code):
                 of_code.append(detail)
-        at = "" if self.stopped_s is None else f"{datetime.fromtimestamp(self.stopped_s):%Y-%m-%d %H:%M}"
-        return tuple(Fault(code, "; ".join(of_code), stopped_at=at) for code, of_code in details.items())
+        when = "" if self.stopped_s is None else f"stopped at {datetime.fromtimestamp(self.stopped_s):%Y-%m-%d %H:%M}"
+        return tuple(Fault(code, "; ".join(of_code), when=when) for code, of_code in details.items())
 
     @classmethod
     def of(cls, loop: ControlLoop) -> "Remembered":

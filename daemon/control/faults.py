@@ -308,8 +308,8 @@ class Fault:
     is_consequence: bool = False
     # When its cause was measured (CLOCK_MONOTONIC), if a measurement shows it.
     t_ns: int | None = field(default=None, compare=False)
-    # When it stopped the rig of an earlier process, by the wall clock; empty for a fault of this process.
-    stopped_at: str = field(default="", compare=False)
+    # When it stopped the rig of an earlier process, in words; empty for a fault of this process.
+    when: str = field(default="", compare=False)
     # Whether it is known to be over, though its stop still waits for the operator.
     is_over: bool = field(default=False, compare=False)
 
@@ -321,11 +321,10 @@ class Fault:
     @property
     def cause(self) -> str:
         """The sentence without its full stop, and without the cure; first when it was, where it is told of the past."""
-        past = [f"stopped at {self.stopped_at}"] if self.stopped_at else []
-        past += ["over by now"] if self.is_over else []
+        when = ", ".join(filter(None, (self.when, "over by now" if self.is_over else "")))
         # A driver's detail may end with a full stop; the sentence has its own.
         sentence = self.rule.sentence.format(detail=self.detail.removesuffix(".")).removesuffix(".")
-        return f"{', '.join(past)}: {sentence}" if past else sentence
+        return f"{when}: {sentence}" if when else sentence
 
     @property
     def sentence(self) -> str:

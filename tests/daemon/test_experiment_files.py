@@ -23,6 +23,7 @@ from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.messaging.deadlines import Deadline
+from shearloop.daemon.operator_questions import start_question
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.sensing.sessions import torque_sources
@@ -293,7 +294,7 @@ async def test_a_state_that_cannot_be_kept_refuses_every_start_before_its_questi
     one.memory = SimpleNamespace(error="the disk is full")
     assert one.start_refusal() == "the disk is full"
     with pytest.raises(UserError, match="the disk is full"):
-        await one.start_question(write(folder / "one.yaml", VALID))
+        await start_question(one, write(folder / "one.yaml", VALID))
 
 
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):

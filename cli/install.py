@@ -24,15 +24,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print and run each step, or only print it with --dry-run."""
-    from shearloop.tools.service import find_program, install_steps, uninstall_steps
+    from shearloop.tools.service import find_program, in_system, install_steps, uninstall_steps
 
     root = args.root.absolute()
+    if not root.is_dir():
+        raise UserError(f"--root {args.root} is not a folder; give the folder with the other system's files")
     running = root == Path("/") and Path("/run/systemd/system").is_dir()
     steps = uninstall_steps(root, running=running)
     if args.installs:
-        program = find_program() if args.program is None else args.program.absolute()
-        if not program.is_file():
-            raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
+        program = in_system(root, find_program() if args.program is None else args.program)
         steps = install_steps(root, program, real_time=args.real_time, running=running)
     if not args.dry_run and root == Path("/") and os.geteuid() != 0:
         raise UserError("this changes the system: run it with sudo, or see what it would do with --dry-run")

@@ -61,6 +61,23 @@ def find_program() -> Path:
     return program
 
 
+def in_system(root: Path, program: Path) -> Path:
+    """Return a program's path in the system below `root`; raises UserError if it is not there.
+
+    It is given as that system has it, or as this one does.
+    """
+    path = program.absolute()
+    if path.is_relative_to(root):
+        path = Path("/") / path.relative_to(root)
+    if not (root / path.relative_to("/")).is_file():
+        where = "" if root == Path("/") else f" below {root}"
+        cure = "give the path of the installed `shearloop` with --program"
+        if where:
+            cure = f"install shearloop in that system, and {cure}, as that system has it"
+        raise UserError(f"the program {program} is not a file{where}; {cure}")
+    return path
+
+
 def hidden_folder(path: Path) -> str:
     """Return the folder that hides a path from the service; empty if the service sees the path."""
     return next((folder for folder in _HIDDEN if path.is_relative_to(folder)), "")
@@ -86,10 +103,14 @@ def install_steps(root: Path, program: Path, *, real_time: bool, running: bool) 
         yield _program(["udevadm", "control", "--reload"], "reads the rules for the boards")
         yield _program(["udevadm", "trigger", "--subsystem-match=tty"], "applies them to boards already plugged in")
         yield _program(["systemctl", "daemon-reload"], "reads the unit")
-    yield Step(
-        f"next: join the group with `sudo usermod -aG shearloop $USER`, edit {root / EXAMPLE}, run "
-        f"`shearloop check {root / EXAMPLE}`, then `sudo systemctl enable --now shearloop`"
-    )
+    group, check = "join the group with `sudo usermod -aG shearloop $USER`", f"run `shearloop check /{EXAMPLE}`"
+    if at_root:
+        yield Step(
+            f"next: edit {root / EXAMPLE}, and let that system start the service with `sudo systemctl --root={root} "
+            f"enable shearloop`; once that system runs, {group}, and {check} there"
+        )
+    else:
+        yield Step(f"next: {group}, edit /{EXAMPLE}, {check}, then `sudo systemctl enable --now shearloop`")
 
 
 def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:

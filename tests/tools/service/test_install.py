@@ -7,13 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.tools.service import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
+from shearloop.tools.service import EXAMPLE, PLACES, REAL_TIME, find_program, in_system, install_steps, service_file
 
-PROGRAM = "/usr/bin/true"
+# In the other system, and not on this computer.
+PROGRAM = "/opt/shearloop-of-the-image/bin/shearloop"
 
 
 def files(root: Path) -> set[str]:
-    return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()}
+    return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()} - {PROGRAM[1:]}
+
+
+@pytest.fixture(autouse=True)
+def program(tmp_path) -> Path:
+    path = tmp_path / PROGRAM[1:]
+    path.parent.mkdir(parents=True)
+    path.touch()
+    return path
 
 
 @pytest.fixture
@@ -91,6 +100,17 @@ def test_the_steps_as_json(tmp_path, place):
     assert {"acts": False, "says": f"not there: {tmp_path / EXAMPLE}"} in steps
 
 
+@pytest.mark.parametrize("outside", [False, True])
+def test_the_program_of_another_system_lies_below_its_root(outside, tmp_path, program, ran):
+    """It is named as that system has it, or as this one does."""
+    steps = json.loads(
+        ran("install", "--root", tmp_path, "--program", program if outside else PROGRAM, "--dry-run", "--json").out
+    )["steps"]
+    assert in_system(tmp_path, program if outside else Path(PROGRAM)) == Path(PROGRAM)
+    assert f"systemctl --root={tmp_path} enable shearloop`; once that system runs, join" in steps[-1]["says"]
+    assert "--now" not in steps[-1]["says"]
+
+
 def test_a_running_system_is_notified(tmp_path):
     sentences = [step.sentence for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
     for command in ("udevadm control --reload", "udevadm trigger --subsystem-match=tty", "systemctl daemon-reload"):
@@ -98,7 +118,11 @@ def test_a_running_system_is_notified(tmp_path):
 
 
 def test_mistakes_are_one_sentence(tmp_path, ran, mistake, monkeypatch):
-    assert "is not a file" in mistake("install", "--root", tmp_path, "--program", "no/such/shearloop")
+    said = mistake("install", "--root", tmp_path, "--program", "/usr/bin/true")
+    assert f"the program /usr/bin/true is not a file below {tmp_path}; install shearloop in that system, and" in said
+    assert "the program no/such/shearloop is not a file; give" in mistake("install", "--program", "no/such/shearloop")
+    for command in ("install", "uninstall"):
+        assert f"--root {tmp_path}/none is not a folder" in mistake(command, "--root", tmp_path / "none")
     monkeypatch.setenv("PATH", "")
     said = ran("install", "--root", tmp_path, "--program", PROGRAM, status=2).err
     assert "there is no program systemd-sysusers on this system" in said

@@ -181,10 +181,11 @@ class Commands:
         rig = required_rig(self.rig)
         try:
             if request.get("ask"):
-                from shearloop.daemon.operator_questions import start_question
+                from shearloop.daemon.operator_questions import startable
 
-                question = await start_question(rig, Path(path))
-                return dict(question.facts)
+                _refuse_if(rig.start_refusal())
+                experiment = await startable(Path(path), rig.experiments, rig.control_loop.operator)
+                return dict(rig.question_of(experiment).facts)
             digest, confirmed = request.get("digest"), bool(request.get("confirmed"))
             _refuse_if(await rig.start(Path(path), digest, self._deadline(request), confirmed=confirmed))
         except QuestionChangedError as error:

@@ -4,8 +4,8 @@ Nothing moves while somebody asks, so their modules are loaded then.
 """
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.known_tool import KnownTool, known_at_start
 from shearloop.daemon.control.operator_view import OperatorView, activation_sentence
@@ -16,31 +16,24 @@ from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
 from shearloop.daemon.questions import Question, digest_of
 from shearloop.errors import UserError
 
-if TYPE_CHECKING:
-    from shearloop.daemon.rig import Rig
 
-
-async def start_question(rig: "Rig", path: Path) -> Question:
-    """Return the question before a start, with the first motion, and the plan; raises UserError as `Rig.start` does."""
-    if (reason := rig.start_refusal()) is not None:
+async def startable(path: Path, files: ExperimentFiles, operator: OperatorView) -> ReadExperiment:
+    """Return the experiment of a file; raises UserError if it is not valid, or cannot begin with the present tool."""
+    experiment = await files.read(path)
+    if (reason := file_refusal(operator, experiment.file)) is not None:
         raise UserError(reason)
-    experiment = await rig.experiments.read(path)
-    if (reason := file_refusal(rig.control_loop.operator, experiment.file)) is not None:
-        raise UserError(reason)
-    return rig.question_of(experiment)
+    return experiment
 
 
-def question_of(
-    experiment: ReadExperiment, files: ExperimentFiles, operator: OperatorView, warm_up_s: float, *occasion: str
-) -> Question:
+def question_of(experiment: ReadExperiment, files: ExperimentFiles, loop: ControlLoop, *occasion: str) -> Question:
     """Return the question before the start of an experiment; `files` know its rig.
 
-    `warm_up_s` passes after a grip until the first torque. `occasion` changes with each process, stop and run.
+    `occasion` changes with each process, stop and run.
     """
-    file = experiment.file
+    file, operator = experiment.file, loop.operator
     limits = files.robot.settings.limits if files.robot is not None else None
-    start, loop = start_of(operator), files.config.loop
-    plan = plan_of(file, limits, files.config.gripper_model, warm_up_s=warm_up_s, start=start, loop=loop)
+    start, speeds = start_of(operator), files.config.loop
+    plan = plan_of(file, limits, files.config.gripper_model, warm_up_s=loop.warm_up_s, start=start, loop=speeds)
     motion, note = plan.first_motion, activation_note(operator, file)
     text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
     if rests_on := tool_note(file, files.config, files.sources, files.robot):

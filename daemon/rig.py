@@ -287,8 +287,7 @@ class Rig:
         """Return the question before an experiment, while nothing runs: only then its modules are loaded."""
         from shearloop.daemon.operator_questions import question_of
 
-        loop = self.control_loop
-        return question_of(experiment, self.experiments, loop.operator, loop.warm_up_s, *self.occasion())
+        return question_of(experiment, self.experiments, self.control_loop, *self.occasion())
 
     def occasion(self) -> tuple[str, ...]:
         """Return what changes with each process, stop and run: a question from before it asks for another moment."""

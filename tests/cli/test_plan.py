@@ -392,7 +392,7 @@ async def test_the_question_before_a_start_has_the_speeds_of_the_loop(tmp_path):
     path = written(tmp_path, {"do": "release"}, {"do": "turn_to", "angle_rad": 0.0, "speed_rad_per_s": 0.2})
     robot = Commissioning(read_settings(ROBOT), None, emulated=True)
     files = ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot, LoadedFiles(()))
-    question = question_of(await files.read(path), files, Rig(new_loop()).control_loop.operator, 0.0)
+    question = question_of(await files.read(path), files, Rig(new_loop()).control_loop)
     assert "turns wrist 3 to 0 rad (0°) at 0.05 rad/s" in "".join(question.plan)
 
 

@@ -23,7 +23,6 @@ from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.messaging.command_server import MAX_CONCURRENT, CommandRefusedError
 from shearloop.daemon.messaging.deadlines import Deadline
-from shearloop.daemon.operator_questions import start_question
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.sensing.sessions import torque_sources
@@ -293,8 +292,8 @@ async def test_a_state_that_cannot_be_kept_refuses_every_start_before_its_questi
     assert one.start_refusal() is None
     one.memory = SimpleNamespace(error="the disk is full")
     assert one.start_refusal() == "the disk is full"
-    with pytest.raises(UserError, match="the disk is full"):
-        await start_question(one, write(folder / "one.yaml", VALID))
+    with pytest.raises(CommandRefusedError, match="the disk is full"):
+        await answers_of(one)["start"]({"experiment": str(write(folder / "one.yaml", VALID)), "ask": True})
 
 
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):

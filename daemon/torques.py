@@ -65,7 +65,7 @@ class TorqueSource:
     """A source of torques: its period and the averaging window of one torque.
 
     `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
-    `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
+    `from_robot`: the torque comes with the robot's state, from no device of its own. `measures_torque` is False for a
     fingertip without a calibration; a silent one is a fault all the same. `warm_up_s`: the longest time from a grip to
     the first torque; 0 for a source that measures without a grip. `has_gain`: an `adapt` step can correct its gain.
     `noise_nm`: the torque is known to this; such a source supervises beyond it only, and drives nothing gentler.

@@ -4,10 +4,11 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.faults import Fault, FaultCode
-from shearloop.daemon.control.inputs import GripperStatus, LatestInputs
+from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 from shearloop.daemon.torques import TorqueSample, TorqueSource
@@ -142,20 +143,35 @@ def _largest(inputs: LatestInputs, source: TorqueSource) -> TorqueSample | None:
 
 
 def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_ns: int) -> list[Fault]:
-    source = watched.driving
-    # The age of a robot's torque is checked with its state.
-    judged = (*(one for one in watched.supervising if not one.from_robot), source)
-    faults = [_unusable(inputs, one, t_ns) for one in judged]
-    found = [fault for fault in faults if fault is not None]
-    latest = inputs.torques.get(source.name)
-    if faults[-1] is not None or latest is None or latest.torque_nm is None:
-        return found
-    if step.expected_nm is not None and abs(latest.torque_nm - step.expected_nm) > watched.config.max_innovation_nm:
-        jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {step.expected_nm:+.3f} N·m was expected"
-        found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped, t_ns=latest.t_mid_ns))
+    driving, robot_is_silent = watched.driving, _is_silent(inputs.arm, watched.patience, t_ns)
+    # A torque that comes with the robot's state is silent with it, which is a fault of its own.
+    judged = [one for one in (*watched.supervising, driving) if not (one.from_robot and robot_is_silent)]
+    unusable = {one.name: fault for one in judged if (fault := _unusable(inputs, one, t_ns)) is not None}
+    found = [*unusable.values()]
+    if driving.name not in unusable and step.expected_nm is not None:
+        found += _jump(inputs.torques.get(driving.name), step.expected_nm, watched.config.max_innovation_nm)
     for other in watched.supervising:
-        found += _disagreement(inputs, other, watched, t_ns)
+        if not other.measures_torque:
+            continue
+        compared = _latest_comparison(inputs, driving, other, t_ns)
+        if compared is not None:
+            found += compared.disagreement(inputs, watched.config)
+        elif not (unusable or robot_is_silent):
+            # Two sensors that are never compared do not supervise each other.
+            alone = f"no torque of {other.name} is of the same time as one of {driving.name}, to compare them"
+            found.append(Fault(FaultCode.ESTIMATE_INVALID, alone))
     return found
+
+
+def _jump(latest: TorqueSample | None, expected_nm: float, allowed_nm: float) -> list[Fault]:
+    if latest is None or latest.torque_nm is None or abs(latest.torque_nm - expected_nm) <= allowed_nm:
+        return []
+    jumped = f"{latest.source} measured {latest.torque_nm:+.3f} N·m where {expected_nm:+.3f} N·m was expected"
+    return [Fault(FaultCode.ESTIMATE_JUMPED, jumped, t_ns=latest.t_mid_ns)]
+
+
+def _is_silent(arm: ArmStatus | None, patience: float, t_ns: int) -> bool:
+    return arm is None or t_ns - arm.t_ns > patience * ARM_STALE_S * 1e9
 
 
 def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | None:
@@ -164,18 +180,21 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | 
     if source.name in inputs.lost:
         gone = "not connected yet" if latest is None else "gone"
         return Fault(FaultCode.SENSOR_LOST, f"{source.name} is {gone}: {inputs.lost[source.name]}")
+    no_torque = inputs.arm.no_torque if source.from_robot and inputs.arm is not None else ""
+    why = f": {no_torque}" if no_torque else ""
     if latest is None:
-        return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
+        return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet{why}")
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     transport_s = measured_s - came_s - source.acquired_s
     if measured_s > source.oldest_s and transport_s > came_s:
         return Fault(FaultCode.ESTIMATE_LATE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
     if came_s > source.fresh_s:
-        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed"
+        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed{why}"
         return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
     if measured_s > source.oldest_s:
-        return Fault(FaultCode.ESTIMATE_STALE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
+        late = _late(source, what, came_s, measured_s)
+        return Fault(FaultCode.ESTIMATE_STALE, f"{late}{why}", t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
         said = f"{source.name} says: {latest.reason}" if latest.reason else f"{source.name} gives no torque"
         return Fault(FaultCode.ESTIMATE_INVALID, said, t_ns=latest.t_mid_ns)
@@ -189,35 +208,51 @@ def _late(source: TorqueSource, what: str, came_s: float, measured_s: float) -> 
     )
 
 
-def _disagreement(inputs: LatestInputs, other: TorqueSource, watched: Watched, t_ns: int) -> list[Fault]:
-    """Compare the driving torque with another, over the window of the slower source's latest sample."""
-    slow, fast, config = watched.driving, other, watched.config
-    if slow.period_s < fast.period_s:
-        slow, fast = fast, slow
-    latest = inputs.torques.get(slow.name)
-    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > slow.fresh_s * 1e9:
-        return []
-    other_nm = _torque_at(inputs, fast, latest.t_mid_ns, 0.5 * max(slow.window_s, fast.period_s))
-    if other_nm is None:
-        return []
-    apart_nm = abs(fast.as_read_nm(latest.torque_nm) - slow.as_read_nm(other_nm))
-    allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm
-    if apart_nm <= allowed_nm:
-        return []
-    apart = (
-        f"{slow.name} measured {latest.torque_nm:+.3f} N·m and {fast.name} {other_nm:+.3f} N·m, "
-        f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
-    )
-    # A torque on another tool than the calibrated one may be off by any factor.
-    notes = [one.note for source in (slow, fast) if (one := inputs.torques.get(source.name)) is not None and one.note]
-    return [Fault(FaultCode.TORQUES_DISAGREE, "; ".join((apart, *notes)), t_ns=latest.t_mid_ns)]
+class _Comparison(NamedTuple):
+    """The torques of two sources at one time, the slower source's first."""
+
+    slow: TorqueSource
+    fast: TorqueSource
+    slow_nm: float
+    fast_nm: float
+    t_ns: int
+
+    def disagreement(self, inputs: LatestInputs, config: LoopConfig) -> list[Fault]:
+        """Return the fault of two torques that are too far apart; none where they agree."""
+        slow, fast, slow_nm, fast_nm, t_ns = self
+        apart_nm = abs(fast.as_read_nm(slow_nm) - slow.as_read_nm(fast_nm))
+        allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm
+        if apart_nm <= allowed_nm:
+            return []
+        apart = (
+            f"{slow.name} measured {slow_nm:+.3f} N·m and {fast.name} {fast_nm:+.3f} N·m, "
+            f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
+        )
+        # A torque on another tool than the calibrated one may be off by any factor.
+        latest = (inputs.torques.get(source.name) for source in (slow, fast))
+        notes = [one.note for one in latest if one is not None and one.note]
+        return [Fault(FaultCode.TORQUES_DISAGREE, "; ".join((apart, *notes)), t_ns=t_ns)]
+
+
+def _latest_comparison(
+    inputs: LatestInputs, driving: TorqueSource, other: TorqueSource, t_ns: int
+) -> _Comparison | None:
+    """Compare two sources over the window of the slower one's latest sample that can be compared; None without one.
+
+    A sample that is late or lost must not lift a disagreement, so the comparison before it counts.
+    """
+    slow, fast = (other, driving) if driving.period_s < other.period_s else (driving, other)
+    times_ns, torques_nm = inputs.history.get(slow.name, ([], []))
+    oldest_ns = t_ns - round(1e9 * compared_for_s((slow, fast)))
+    half_s = 0.5 * max(slow.window_s, fast.period_s)
+    for at in range(len(times_ns) - 1, bisect_left(times_ns, oldest_ns) - 1, -1):
+        if (fast_nm := _torque_at(inputs, fast, times_ns[at], half_s)) is not None:
+            return _Comparison(slow, fast, torques_nm[at], fast_nm, times_ns[at])
+    return None
 
 
 def _torque_at(inputs: LatestInputs, source: TorqueSource, t_ns: int, half_s: float) -> float | None:
-    """Return a source's mean torque within `half_s` of a time, else its nearest one; None where that is too far away.
-
-    A sample that is late or lost must not lift a disagreement.
-    """
+    """Return a source's mean torque within `half_s` of a time, else its nearest one; None if that is too far away."""
     times_ns, torques_nm = inputs.history.get(source.name, ([], []))
     half_ns = round(half_s * 1e9)
     first, end = bisect_left(times_ns, t_ns - half_ns), bisect_right(times_ns, t_ns + half_ns)
@@ -248,7 +283,7 @@ def _device_faults(inputs: LatestInputs, watched: Watched, step: RunningStep | N
             gone = (FaultCode.ROBOT_LOST, reason) if name == "robot" else (FaultCode.DEVICE_LOST, f"{name}: {reason}")
             found.append(Fault(*gone))
     if arm is not None:
-        if t_ns - arm.t_ns > watched.patience * ARM_STALE_S * 1e9:
+        if _is_silent(arm, watched.patience, t_ns):
             stale = f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago"
             found.append(Fault(FaultCode.STATE_STALE, stale, t_ns=arm.t_ns))
         elif arm.emergency_stop:

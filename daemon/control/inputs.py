@@ -27,6 +27,8 @@ class ArmStatus:
     late: bool = False
     # Nothing but the start of an experiment is missing: it enables the arm.
     enabled_by_start: bool = False
+    # Why no torque of the wrench comes with it; empty where one does.
+    no_torque: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -322,6 +322,8 @@ class ControlLoopRunner:
         return stopped
 
     def _take_state(self, state: RobotState) -> None:
+        wrench = self._wrench
+        wrench.add(state)
         self._control_loop.on_arm(
             ArmStatus(
                 wrist_rad=state.wrist_rad,
@@ -333,11 +335,10 @@ class ControlLoopRunner:
                 starting=state.recovering,
                 late=state.late,
                 enabled_by_start=state.awaits_enable,
+                no_torque=wrench.why_unknown,
             )
         )
-        wrench = self._wrench
-        wrench.add(state)
-        if self.states.publish_robot(state, wrench.torque_nm) and wrench.known:
+        if self.states.publish_robot(state, wrench) and wrench.known:
             # The torque on the tool is opposite to the wrench on the wrist.
             torque = TorqueSample(WRENCH, -wrench.torque_nm, "", wrench.t_mid_ns, self._clock.now_ns())
             self._control_loop.on_torque(torque)

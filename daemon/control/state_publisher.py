@@ -11,13 +11,20 @@ from shearloop.daemon.control.experiment import Experiment
 from shearloop.daemon.control.faults import FaultCode, Response
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.torque_controller import TorqueController
+from shearloop.daemon.control.wrench import WrenchMean
 from shearloop.daemon.messaging.messages import LoopState, LoopStop, RobotStateMessage, cause_of
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.ur.messages import RobotState
 
 LOOP_STATE_PERIOD_S = 1.0
+UNTARED = (
+    "no zero of the wrench is known, because none was taken since this daemon began, or it was lost with the "
+    "connection: a step `tare` takes one"
+)
 # The columns of `robot.state` that are not in the robot's state under the same name, and those that are.
-_OWN = {"source", "t_mono_ns", "joints_rad", "age_s", "wrist_torque_nm"}
+_TORQUE = {"wrist_torque_nm", "wrist_torque_valid", "wrist_torque_reason"}
+_OWN = {"source", "t_mono_ns", "joints_rad", "age_s", *_TORQUE}
 _SAME = {column.name for column in fields(RobotStateMessage)} - _OWN
 
 
@@ -37,18 +44,21 @@ class StatePublisher:
     _logged: "_LogKey | None" = None
     _published_ns: int = 0
 
-    def publish_robot(self, state: RobotState, wrist_torque_nm: float) -> bool:
+    def publish_robot(self, state: RobotState, wrench: WrenchMean) -> bool:
         """Publish each `every`th state, with the mean torque of the latest ones; return whether it was this one."""
         if (block := state.cycle // self.every) == self._block:
             return False
         self._block = block
+        reason = wrench.why_unknown or ("" if self.control_loop.has_zero(WRENCH) else UNTARED)
         same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
         message = RobotStateMessage(
             source="robot",
             t_mono_ns=state.measured_ns,
             joints_rad=state.q_rad,
             age_s=state.age_ns / 1e9,
-            wrist_torque_nm=wrist_torque_nm,
+            wrist_torque_nm=wrench.torque_nm if wrench.known else None,
+            wrist_torque_valid=not reason,
+            wrist_torque_reason=reason,
             **same,
         )
         self.publisher.publish(message)

@@ -4,12 +4,10 @@ from collections import deque
 
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.drivers.ur.messages import RobotState
-from shearloop.drivers.ur.settings import WRENCH_STATES
+from shearloop.drivers.ur.settings import ENOUGH_STATES, WRENCH_STATES
 
 # How often the robot's state is published, with a torque of the wrench; and the time that the torque is a mean over.
 PUBLISHED_HZ, MEAN_OVER_S = 25.0, 0.192
-# This fraction of the states in a mean's time must be there.
-_ENOUGH = 2.0 / 3.0
 
 
 def publish_every(rate_hz: float) -> int:
@@ -31,7 +29,7 @@ def wrench_source(rate_hz: float, noise_nm: float = 0.0) -> TorqueSource:
 
 def wrench_window_s(rate_hz: float) -> float:
     """Return the time that a mean is over: long enough for `WRENCH_STATES` states where some are missing."""
-    return max(MEAN_OVER_S, WRENCH_STATES / (_ENOUGH * rate_hz))
+    return max(MEAN_OVER_S, WRENCH_STATES / (ENOUGH_STATES * rate_hz))
 
 
 class WrenchMean:
@@ -39,9 +37,7 @@ class WrenchMean:
 
     def __init__(self, rate_hz: float) -> None:
         """Begin without a state."""
-        window_s = wrench_window_s(rate_hz)
-        self._window_ns = round(1e9 * window_s)
-        self._enough = round(_ENOUGH * window_s * rate_hz)
+        self._rate_hz, self._window_ns = rate_hz, round(1e9 * wrench_window_s(rate_hz))
         # Times by the controller's clock in ns, ascending, and torques in N·m.
         self._states: deque[tuple[int, float]] = deque()
 
@@ -57,7 +53,17 @@ class WrenchMean:
     @property
     def known(self) -> bool:
         """Whether the mean is of enough states."""
-        return len(self._states) >= self._enough
+        return len(self._states) >= WRENCH_STATES
+
+    @property
+    def why_unknown(self) -> str:
+        """Why there is no mean, in a sentence; empty where it is known."""
+        if self.known:
+            return ""
+        return (
+            f"{len(self._states)} of the robot's states came in {self._window_ns / 1e9:.2f} s, and a torque takes "
+            f"{WRENCH_STATES} (`rate_hz` of its settings is {self._rate_hz:g})"
+        )
 
     @property
     def torque_nm(self) -> float:

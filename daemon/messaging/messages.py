@@ -175,9 +175,13 @@ class RobotStateMessage(Message):
     )
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
-    wrist_torque_nm: float = column(
-        "N·m", "wrench about the tool's axis, mean over 0.2 s; the torque on the tool is its negative"
+    wrist_torque_nm: float | None = column(
+        "N·m",
+        "wrench about the tool's axis, mean over 0.2 s, which takes 16 states, else nil; the torque on the tool is its "
+        "negative; it can be used only if `wrist_torque_valid` is true",
     )
+    wrist_torque_valid: bool = column("", "whether that torque can be used: it is known, and its zero was taken")
+    wrist_torque_reason: str = column("", "why it cannot be used, in a sentence; empty when it can")
     robot_mode: int = column("", "the controller's robot mode, 7 when running")
     safety_mode: int = column("", "the controller's safety mode, 1 when normal")
     speed_scaling: float = column(

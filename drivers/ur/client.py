@@ -10,7 +10,7 @@ import platform
 import signal
 import sys
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from importlib import import_module
@@ -22,7 +22,7 @@ from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.script import CLIENT_VERSION, why_other_client
-from shearloop.drivers.ur.settings import Six, UrSettings
+from shearloop.drivers.ur.settings import ENOUGH_STATES, Six, UrSettings
 from shearloop.timeouts import timeout
 
 # The settings for a controller, by its version and its serial number.
@@ -41,6 +41,7 @@ CONTROLLING = "controlling"
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
 # Interval of the checks for a silent worker.
 WATCH_S = 0.1
+_SECOND_NS = 10**9
 
 
 def missing_library() -> str:
@@ -87,6 +88,8 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         # The number of states that have arrived.
         self.states = 0
+        # When each new state of the latest second was measured, in ns; a repeated one is not new.
+        self._measured_ns: deque[int] = deque()
         self._holds = holds
         self._told_held = False
         self._wrench_zero: Six = (0.0,) * 6
@@ -126,8 +129,27 @@ class UrRobot:
             "connected": self.state is not None,
             "states": self.states,
             "errors": dict(self.losses),
-            "error": "" if self.monitor.latest.up else self.monitor.latest.sentence,
+            "rate_hz": self.measured_hz,
+            "expected_hz": self.settings.rate_hz,
+            "error": self._why_slow() if self.monitor.latest.up else self.monitor.latest.sentence,
         }
+
+    @property
+    def measured_hz(self) -> float | None:
+        """How many new states a second came in the latest second; None before there are two."""
+        if len(self._measured_ns) < 2:
+            return None
+        return 1e9 * (len(self._measured_ns) - 1) / (self._measured_ns[-1] - self._measured_ns[0])
+
+    def _why_slow(self) -> str:
+        """Return how much slower the states come than configured; empty where they come as planned."""
+        measured_hz, rate_hz = self.measured_hz, self.settings.rate_hz
+        if measured_hz is None or measured_hz >= ENOUGH_STATES * rate_hz:
+            return ""
+        return (
+            f"the robot's states come at {measured_hz:.0f} Hz, and `rate_hz` of its settings is {rate_hz:g}: end other "
+            "programs on this computer, look at the network, or lower `rate_hz`"
+        )
 
     async def next_state(self) -> messages.RobotState:
         """Return the next state, also after a loss of the connection."""
@@ -202,6 +224,7 @@ class UrRobot:
     def _disconnect(self, reason: str) -> None:
         self._connection = None
         self.state = self.rests_since_ns = None
+        self._measured_ns.clear()
         for number in list(self._replies):
             self.handle_message(number, messages.CommandReply(reason))
 
@@ -218,6 +241,10 @@ class UrRobot:
                     # The restored zero ends with a tare, or with a program's start without a load.
                     self._restored_zero = (0.0,) * 6
                 self.states += 1
+                if before is None or message.measured_ns > before.measured_ns:
+                    self._measured_ns.append(message.measured_ns)
+                    while self._measured_ns[0] < message.measured_ns - _SECOND_NS:
+                        self._measured_ns.popleft()
                 if self._connection is not None:
                     self._tell_held(self._connection)
                 if before is None:

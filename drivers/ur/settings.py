@@ -58,6 +58,8 @@ Generation = Literal["e-series", "cb3"]
 MAX_ASIDE_M, MAX_TILT_RAD = 0.01, 0.05
 # A torque of the wrench is the mean of at least this number of states.
 WRENCH_STATES: Final = 16
+# Of the states of `rate_hz`, fewer than this fraction are too few to rely on.
+ENOUGH_STATES: Final = 2.0 / 3.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,7 +41,10 @@ _FILE = "chunk-000/file-000.parquet"
 _AGE = "observation.age_s"
 # The feature of each topic and its keys.
 _FEATURES: Mapping[str, tuple[str, str]] = {
-    RobotStateMessage.topic: ("state", "joints_rad tcp_pose wrench wrist_rad wrist_speed_rad_per_s wrist_torque_nm"),
+    RobotStateMessage.topic: (
+        "state",
+        "joints_rad tcp_pose wrench wrist_rad wrist_speed_rad_per_s wrist_torque_nm wrist_torque_valid",
+    ),
     EitEstimate.topic: (
         "estimate",
         "torque_nm torque_low_nm torque_high_nm diameter_mm diameter_low_mm diameter_high_mm k sigma score valid",

@@ -58,7 +58,9 @@ function torqueOf(link, topic, source) {
 // The wrench on the wrist is opposite to the torque on the tool.
 function wrenchTorque(link) {
   const message = link.get("robot.state");
-  return message && { message, name: "robot's wrench", value: -message.content.wrist_torque_nm, valid: true, reason: "" };
+  if (!message) return undefined;
+  const { wrist_torque_nm: torque, wrist_torque_valid: valid, wrist_torque_reason: reason } = message.content;
+  return { message, name: "robot's wrench", value: torque == null ? torque : -torque, valid, reason };
 }
 
 // The torque that drives the loop; before the first experiment, an estimate, the skin or the load cell.
@@ -220,7 +222,9 @@ export function robotPanel(link) {
   warn(byId("robot-blocked"), stops.filter(Boolean).join(": "), link.idle() && startable);
   put(byId("wrist"), link.number(message, "wrist_rad", 3, SIGNED));
   put(byId("wrist-speed"), link.number(message, "wrist_speed_rad_per_s", 3, SIGNED));
-  put(byId("wrist-torque"), number(wrenchTorque(link).value, 3, link.unit(message.topic, "wrist_torque_nm"), SIGNED));
+  const torque = wrenchTorque(link);
+  const measured = number(torque.value, 3, link.unit(message.topic, "wrist_torque_nm"), SIGNED);
+  put(byId("wrist-torque"), torque.valid ? measured : `not valid: ${torque.reason}`);
   put(byId("robot-mode"), mode(ROBOT_MODES, said.robot_mode));
   put(byId("safety-mode"), mode(SAFETY_MODES, said.safety_mode));
   put(byId("speed-scaling"), `${number(100 * said.speed_scaling, 0)} %`);

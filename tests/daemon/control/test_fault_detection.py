@@ -23,6 +23,7 @@ EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
 WRENCH = TorqueSource(name="wrench", period_s=0.04, from_robot=True)
 NOW_NS = 100_000_000_000
+FRESH_ARM = ArmStatus(0.0, NOW_NS)
 
 
 def torque(
@@ -52,16 +53,20 @@ def faults(
 
 
 def found(
-    *torques: TorqueSample, driving: TorqueSource = EIT, supervising: tuple[TorqueSource, ...] = (LOAD, WRENCH)
+    *torques: TorqueSample,
+    driving: TorqueSource = EIT,
+    supervising: tuple[TorqueSource, ...] = (LOAD,),
+    arm: ArmStatus = FRESH_ARM,
 ) -> dict[FaultCode, str]:
-    senses = LatestInputs(10.0, arm=ArmStatus(0.0, NOW_NS))
+    senses = LatestInputs(10.0, arm=arm)
     for each in torques:
         senses.add_torque(each)
     return {each.code: each.sentence for each in faults(senses, driving, supervising)}
 
 
 def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike():
-    assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, 0.1)) == {}
+    alike = (torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, 0.1))
+    assert found(*alike, supervising=(LOAD, WRENCH)) == {}
 
 
 def test_a_supervising_sensor_whose_torque_is_void_holds_the_wrist_and_says_why():
@@ -131,8 +136,49 @@ def test_torques_of_other_moments_are_not_compared():
     assert FaultCode.TORQUES_DISAGREE not in found(load, wrench, driving=LOAD, supervising=(WRENCH,))
 
 
-def test_the_wrench_is_watched_with_the_state_that_it_comes_with():
-    assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, None)) == {}
+def test_a_wrench_whose_torque_does_not_come_with_the_robots_state_holds_the_wrist_and_says_why():
+    """States that come too slowly are fresh, but make no mean: the wrench would supervise nothing, without a word."""
+    arm, heard = ArmStatus(0.0, NOW_NS, no_torque="13 states came"), (torque(EIT, 0.1), torque(LOAD, 0.1))
+    for before in ((), (torque(WRENCH, 0.1, came_s=0.2),)):
+        for driving, supervising in ((EIT, (LOAD, WRENCH)), (WRENCH, (LOAD,))):
+            events = found(*heard, *before, driving=driving, supervising=supervising, arm=arm)
+            assert events.keys() == {FaultCode.ESTIMATE_STALE}
+            assert "wrench" in events[FaultCode.ESTIMATE_STALE]
+            assert "13 states came" in events[FaultCode.ESTIMATE_STALE]
+
+
+def test_a_wrench_without_a_state_of_the_robot_is_no_second_fault():
+    heard = (torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, 0.1, came_s=0.9))
+    silent = ArmStatus(0.0, NOW_NS - round(0.9e9))
+    assert found(*heard, supervising=(LOAD, WRENCH), arm=silent).keys() == {FaultCode.STATE_STALE}
+
+
+@pytest.mark.parametrize("later_nm", [0.15, 0.2])
+def test_a_disagreement_lasts_until_a_comparison_agrees(later_nm):
+    """The wrench has a gap: no torque of it is near the load cell's latest ones, which grow without a break."""
+    heard = [torque(WRENCH, 0.0, came_s=0.4 - 0.04 * number) for number in range(5)]
+    heard += [torque(LOAD, later_nm if number else 0.15, came_s=0.4 - 0.09 * number) for number in range(5)]
+    patient = replace(WRENCH, min_fresh_s=5.0)
+    assert found(*heard, driving=LOAD, supervising=(patient,)).keys() == {FaultCode.TORQUES_DISAGREE}
+    # The next pair agrees.
+    heard += [torque(WRENCH, later_nm), torque(LOAD, later_nm)]
+    assert found(*heard, driving=LOAD, supervising=(patient,)) == {}
+
+
+def test_a_disagreement_lasts_while_a_sensor_is_void():
+    """Else a sensor that is void now and then would let the disagreement's hold run down."""
+    before = [torque(WRENCH, 0.0, came_s=0.1), torque(LOAD, 0.3, came_s=0.1)]
+    void = torque(LOAD, None, why="a spike")
+    events = found(*before, torque(WRENCH, 0.0), void, driving=LOAD, supervising=(WRENCH,))
+    assert events.keys() == {FaultCode.ESTIMATE_INVALID, FaultCode.TORQUES_DISAGREE}
+
+
+def test_two_sensors_that_cannot_be_compared_do_not_supervise_each_other():
+    patient = replace(WRENCH, min_fresh_s=1.0)
+    heard = torque(LOAD, 0.1), torque(WRENCH, 0.1, came_s=0.9)
+    events = found(*heard, driving=LOAD, supervising=(patient,))
+    assert "wrench" in events[FaultCode.ESTIMATE_INVALID]
+    assert events.keys() == {FaultCode.ESTIMATE_INVALID}
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD])

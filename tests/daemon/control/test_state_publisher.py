@@ -15,7 +15,7 @@ from shearloop.daemon.messaging.messages import RobotStateMessage, wire_map
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.torques import WRENCH
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, driven
-from tests.drivers.ur.handler_bench import SETTINGS
+from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 
 class DoubtfulCell(Cell):
@@ -62,6 +62,45 @@ async def test_a_state_of_the_robot_has_the_time_of_its_measurement():
         *_, message = (one for one in cell.published.messages if isinstance(one, RobotStateMessage))
     assert message.age_s == age_ns / 1e9
     assert message.t_mono_ns + age_ns in read_ns
+
+
+async def every_second_state_is_new(cell: Cell, cycles: int) -> None:
+    """Let the controller send 62 states a second where 125 are configured."""
+    for number in range(cycles):
+        cell.robot.bench.arm.be(age_ns=CYCLE_NS * (number % 2))
+        await cell.cycles(1)
+
+
+def states_of(cell: Cell) -> list[RobotStateMessage]:
+    return [one for one in cell.published.messages if isinstance(one, RobotStateMessage)]
+
+
+async def test_states_that_are_too_few_give_no_torque_which_is_said_and_holds_the_wrist():
+    async with driven() as cell:
+        assert states_of(cell)[-1].wrist_torque_valid
+        await cell.start(TWIST)
+        await every_second_state_is_new(cell, 140)
+        state = states_of(cell)[-1]
+        assert (state.wrist_torque_nm, state.wrist_torque_valid) == (None, False)
+        assert "12 of the robot's states came in 0.19 s" in state.wrist_torque_reason
+        assert cell.published.faults == [FaultCode.ESTIMATE_STALE.text]
+        assert state.wrist_torque_reason in cell.published.reasons
+        assert cell.state.wrist_speed_rad_per_s == 0.0
+        health = cell.robot.diagnostics()
+        assert (health["rate_hz"], health["expected_hz"]) == (pytest.approx(62.5, rel=0.1), 125.0)
+        assert "the robot's states come at" in health["error"]
+
+
+async def test_a_torque_of_the_wrench_without_a_zero_is_not_valid():
+    async with driven() as cell:
+        cell.control_loop.on_zero(WRENCH, known=False)
+        await cell.cycles(10)
+        state = states_of(cell)[-1]
+        assert (state.wrist_torque_nm, state.wrist_torque_valid) == (0.0, False)
+        assert "no zero of the wrench is known" in state.wrist_torque_reason
+        cell.control_loop.on_zero(WRENCH)
+        await cell.cycles(10)
+        assert (states_of(cell)[-1].wrist_torque_valid, states_of(cell)[-1].wrist_torque_reason) == (True, "")
 
 
 async def test_a_stop_is_logged_once_however_often_a_state_is_out_of_date():

@@ -328,6 +328,16 @@ def test_the_large_figure_is_the_torque_that_drives(source, name, torque, other,
     browsed.until_shown({"#other-source": other})
 
 
+@pytest.mark.parametrize("torque_nm", [None, -0.3])
+def test_a_torque_of_the_wrench_that_cannot_be_used_is_not_shown_as_one(torque_nm, browsed):
+    reason = "12 of the robot's states came in 0.19 s"
+    unusable = {"wrist_torque_nm": torque_nm, "wrist_torque_valid": False, "wrist_torque_reason": reason}
+    browsed.daemon.say(loop={"torque_source": "wrench"}, robot=unusable)
+    browsed.open()
+    browsed.until_shown({"#torque-now": "–", "#wrist-torque": f"not valid: {reason}"})
+    browsed.until("#torque-reason", f"no torque from the robot's wrench: {reason}")
+
+
 def test_tasks_are_not_well_while_their_data_are_old(browsed):
     alive = {"alive": True, "restarts": 0, "last_error": ""}
     health = {"tasks": {"right": alive, "loop": alive}}

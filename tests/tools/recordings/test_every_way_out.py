@@ -47,7 +47,10 @@ ON_THE_RIG = {
 NOT_IN_RERUN = ("timestamp", "t_mono_ns", "seq", "scores", "scores_shape")
 # Of a LeRobot dataset, by topic.
 FEATURES = {
-    "robot.state": ("state", "joints_rad tcp_pose wrench wrist_rad wrist_speed_rad_per_s wrist_torque_nm"),
+    "robot.state": (
+        "state",
+        "joints_rad tcp_pose wrench wrist_rad wrist_speed_rad_per_s wrist_torque_nm wrist_torque_valid",
+    ),
     "eit.estimate": (
         "estimate",
         "torque_nm torque_low_nm torque_high_nm diameter_mm diameter_low_mm diameter_high_mm k sigma score valid",

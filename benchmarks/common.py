@@ -102,7 +102,7 @@ def write_rig_config(folder: Path, settings: str, **content: Any) -> Path:
     """Write a daemon configuration for `emulated_rig`, with the robot's settings of a file; return its path."""
     robot = yaml.safe_load(Path(settings).read_text())
     (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
-    return write_config(folder, robot="ur.yaml", gripper={"socket": {"host": HOST}}, **content)
+    return write_config(folder, robot="ur.yaml", gripper={"model": "2F-140", "socket": {"host": HOST}}, **content)
 
 
 @contextlib.contextmanager

@@ -34,7 +34,7 @@ from shearloop.drivers.defaults import (
     URCAP_PORT,
 )
 from shearloop.drivers.hosts import is_loopback_host, one_spelling, why_no_address, why_no_host
-from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS, GripperModel, ModelName
+from shearloop.drivers.robotiq.models import MODELS, GripperModel, ModelName
 from shearloop.estimation.defaults import BASELINE_FRAMES
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.words import shown
@@ -252,7 +252,8 @@ class GripperSocket(ConfigModel):
 class GripperConfig(ConfigModel):
     """The gripper, on a socket or on Modbus."""
 
-    model: ModelName = Field(DEFAULT_MODEL, description="the model, which sets stroke, speeds, forces and counts")
+    # No status of a gripper says which model it is.
+    model: ModelName = Field(description="the model, as on its type plate; it sets stroke, speeds, forces and counts")
     socket: GripperSocket | None = Field(None, description="connection through the robot's URCap; else `modbus`")
     modbus: SerialDevice | None = Field(None, description="Modbus RTU by USB; else `socket`")
     calibration: Path | None = Field(

@@ -12,7 +12,7 @@ from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT
-from shearloop.drivers.robotiq.models import DEFAULT_MODEL, MODELS
+from shearloop.drivers.robotiq.models import MODELS
 from shearloop.errors import UserError
 from shearloop.words import counted
 
@@ -37,8 +37,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(way, "--port", Path, "PATH", "the USB adapter's port, for Modbus RTU")
     add_option(parser, "--socket-port", PORT, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
     names = ", ".join(MODELS)
-    text = f"{names}; as `gripper.model` in the configuration (default: %(default)s)"
-    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", default=DEFAULT_MODEL, help=text)
+    text = f"{names}; as on its type plate, and as `gripper.model` in the configuration"
+    parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", required=True, help=text)
     text = "an object's diameter; give it once per object, of at least two; four over half of the stroke show its bow"
     add_option(parser, "--diameter-mm", TOOL_MM, "MM", text, action="append", required=True)
     add_option(parser, "--out", output_path, "FILE", "the calibration file to write", required=True)

@@ -34,6 +34,11 @@ class GripperModel:
     open_counts: float = 3.0
     closed_counts: float = 230.0
 
+    @property
+    def counts_per_mm(self) -> float:
+        """How many counts the bare fingers move for a millimetre, on average."""
+        return (self.closed_counts - self.open_counts) / self.stroke_mm
+
     def why_beyond(self, width_mm: float, speed_mm_per_s: float, force_n: float) -> str:
         """Return which value this model does not have, with its range, or an empty string."""
         for value, (low, high), name, unit in (

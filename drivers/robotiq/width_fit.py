@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from shearloop.drivers.errors import DeviceCalibrationError
-from shearloop.drivers.robotiq.models import COUNTS_MAX, DEFAULT_MODEL, MODELS, GripperModel, ModelName
+from shearloop.drivers.robotiq.models import COUNTS_MAX, MODELS, GripperModel, ModelName
 from shearloop.drivers.robotiq.widths import WidthCalibration
 
 # This many diameters over this fraction of the stroke show whether the width bows.
 _BOW_GAUGES, _BOW_SPREAD = 4, 0.5
-# Of the nominal counts per millimetre: more means diameters in another unit, or another model.
-_STEEPEST = 2.5
+# The next model has 1.6 times as many counts per millimetre, or as few.
+_OTHER_MODEL = 1.5
 
 
-def fit_width(gauges: Sequence[tuple[float, float]], model: ModelName = DEFAULT_MODEL) -> WidthCalibration:
+def fit_width(gauges: Sequence[tuple[float, float]], model: ModelName) -> WidthCalibration:
     """Return the curve through (counts, width in mm) pairs of gripped objects.
 
     Four diameters or more show whether it bows; the scatter about it is then its standard deviation, and one count
@@ -58,11 +58,13 @@ def _line(counts: NDArray[np.float64], widths: NDArray[np.float64], model: Gripp
             "The fingers did not stop further closed on the smaller objects: were they measured in the order "
             "given, and did the fingers hold each of them?"
         )
-    times = -counts_per_mm * model.stroke_mm / COUNTS_MAX
-    if times > _STEEPEST:
+    times = -counts_per_mm / model.counts_per_mm
+    if not _is_like(times):
+        like = (one.name for one in MODELS.values() if _is_like(-counts_per_mm / one.counts_per_mm))
+        similar = "".join(f", which is more like a {name}" for name in like)
         raise DeviceCalibrationError(
             f"Between the objects the fingers moved {times:.1f} times as far as a {model.name} does for these "
-            "diameters: give the diameters in mm, and the model with --model."
+            f"diameters{similar}: correct `gripper.model` or `--model`, and give the diameters in mm."
         )
     residuals = (counts - (closed_counts + counts_per_mm * widths)) / counts_per_mm
     scatter_mm = math.sqrt(float(residuals @ residuals) / (len(counts) - 2)) if len(counts) > 2 else 0.0
@@ -73,6 +75,11 @@ def _line(counts: NDArray[np.float64], widths: NDArray[np.float64], model: Gripp
         closed_counts=closed_counts,
         std_mm=max(scatter_mm, -1 / counts_per_mm),
     )
+
+
+def _is_like(times: float) -> bool:
+    """Return whether a model's bow and its encoder's steps explain so much more, or less, motion of its fingers."""
+    return 1.0 / _OTHER_MODEL < times < _OTHER_MODEL
 
 
 def _bowed(counts: NDArray[np.float64], widths: NDArray[np.float64], model: GripperModel) -> WidthCalibration | None:

@@ -104,7 +104,7 @@ def test_check_and_run_say_the_same_of_a_file_of_another_kind(name, mistake):
             ["device.path: /dev/ttyACM0`, a real device"],
         ),
         (
-            {"emulated": True, "robot": "ur.yaml", "gripper": {"socket": {"host": "192.168.1.10"}}},
+            {"emulated": True, "robot": "ur.yaml", "gripper": {"model": "2F-140", "socket": {"host": "192.168.1.10"}}},
             ["`gripper.socket.host"],
         ),
         (
@@ -149,7 +149,7 @@ async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
         robot="ur.yaml",
-        gripper={"socket": {"host": "127.0.0.1"}},
+        gripper={"model": "2F-140", "socket": {"host": "127.0.0.1"}},
         load_cell={"device": {"path": "load"}},
         experiment="wait.yaml",
         recording={"folder": "recordings"},

@@ -35,7 +35,7 @@ def matlab() -> bytes:
     [
         ("calibrate no.mcap --out", "an estimator's calibration"),
         ("calibrate load --mass-g 100 --lever-arm-mm 35 --port no --out", "a calibration file"),
-        ("calibrate gripper --diameter-mm 10 --diameter-mm 20 --port no --out", "a calibration file"),
+        ("calibrate gripper --model 2F-140 --diameter-mm 10 --diameter-mm 20 --port no --out", "a calibration file"),
         ("skin calibrate no.csv --out", "a calibration file"),
         ("bank build --config {bank} --out", "a bank"),
         ("bank solve --mesh no --model step --k 1 --sigma 1 --out", "an array of NumPy"),

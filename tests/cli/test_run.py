@@ -136,7 +136,7 @@ def robotless(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skips
     robot_at(own_address(7), tmp_path)
     rig = {
         "robot": "ur.yaml",
-        "gripper": {"socket": {"host": own_address(7)}},
+        "gripper": {"model": "2F-140", "socket": {"host": own_address(7)}},
         "load_cell": {"device": {"path": "load"}},
     }
     experiment = str(Path("config/experiments/loosen.yaml").resolve())

@@ -91,7 +91,11 @@ def test_an_address_that_cannot_be_bound_is_refused_with_the_cause(key, address,
 )
 def test_a_host_that_is_no_address_is_refused_everywhere(host, tmp_path):
     assert why_no_host(host)
-    gripper = {"gripper": {"socket": {"host": host}}, "robot": "ur.yaml", "load_cell": {"device": {"path": "port"}}}
+    gripper = {
+        "gripper": {"model": "2F-140", "socket": {"host": host}},
+        "robot": "ur.yaml",
+        "load_cell": {"device": {"path": "port"}},
+    }
     assert "gripper.socket.host: " in refusal(tmp_path, yaml.safe_dump(gripper))
 
 
@@ -127,13 +131,13 @@ def answer_with(*addresses: str) -> Callable[..., list[tuple[Any, ...]]]:
 def test_a_robot_and_its_gripper_are_not_given_by_a_name(addresses, cure, tmp_path, monkeypatch, ran):
     monkeypatch.setattr(name_look_up.socket, "getaddrinfo", answer_with(*addresses))
     name = "is a name, which can mean another device"
-    content = yaml.safe_dump({"gripper": {"socket": {"host": "ur5.lab"}}, "robot": "ur.yaml"})
+    content = yaml.safe_dump({"gripper": {"model": "2F-140", "socket": {"host": "ur5.lab"}}, "robot": "ur.yaml"})
     assert f"gripper.socket.host: 'ur5.lab' {name} {cure}" in refusal(tmp_path, content)
     robot = tmp_path / "ur.yaml"
     robot.write_text(Path("config/ur.yaml").read_text().replace("host: 192.168.1.10", "host: ur5.lab"))
     with pytest.raises(DriverError, match=re.escape(f"host {name} {cure}")):
         read_settings(robot)
-    options = ("--diameter-mm", 10, "--diameter-mm", 20, "--out", tmp_path / "g.cal")
+    options = ("--model", "2F-140", "--diameter-mm", 10, "--diameter-mm", 20, "--out", tmp_path / "g.cal")
     said = ran("calibrate", "gripper", "--host", "ur5.lab", *options, status=2).err
     assert f"--host: 'ur5.lab' {name} {cure}" in said
 

@@ -75,7 +75,7 @@ async def test_the_gripper_of_an_emulated_rig_may_answer_later(emulated, deadlin
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         content = {
-            "gripper": {"socket": {"host": "127.0.0.1", "port": port}},
+            "gripper": {"model": "2F-140", "socket": {"host": "127.0.0.1", "port": port}},
             "emulated": emulated,
             "load_cell": {"device": {"path": "load"}},
         }

@@ -120,7 +120,7 @@ def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(t
 @pytest.mark.parametrize("between", [[], [{"do": "tare"}], [{"do": "release"}], [{"do": "grip"}]])
 def test_hold_torque_is_refused_without_an_identification_of_the_present_tool(tmp_path, between):
     identify, hold = {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.1}
-    gripper = {"socket": {"host": "127.0.0.1"}}
+    gripper = {"model": "2F-140", "socket": {"host": "127.0.0.1"}}
     first = [identify] if between else []
     mistakes = refusal(tmp_path, {"steps": [*first, *between, hold, identify, hold]}, gripper=gripper)
     assert (
@@ -282,7 +282,7 @@ async def test_an_experiment_on_another_tool_than_the_calibrated_one_is_refused(
     ],
 )
 def test_a_plan_says_that_nothing_will_know_the_tool(tmp_path, content, gripper, said):
-    gripper = {"gripper": {"socket": {"host": "127.0.0.1"}, **gripper}}
+    gripper = {"gripper": {"model": "2F-140", "socket": {"host": "127.0.0.1"}, **gripper}}
     daemon = config(tmp_path, {"torque_source": "right", **content}, **CELL, **gripper)
     sources = {"right": of_tool(20.0), **LOAD}
     file = check_experiment(daemon, sources)

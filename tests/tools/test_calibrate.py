@@ -157,7 +157,7 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
         where = gripper.hear("127.0.0.1:" if way == "socket" else str(link))
         host, _, port = where.partition(":")
         reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
-        diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
+        diameters = ("--model", "2F-140", "--diameter-mm", "10", "--diameter-mm", "40")
         # One of the two ways as a script would: what is asked of the operator is then on stderr.
         script = way == "modbus"
         with Process("calibrate", "gripper", *reach, *diameters, "--out", str(out), *["--json"] * script) as calibrate:
@@ -188,7 +188,8 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
     write_memory(memory_path("127.0.0.1"), Remembered(force_n=60.0, running="loosen"))
     with Process("emulate", "gripper-socket", "--port", "0") as gripper:
         host, _, port = gripper.hear("127.0.0.1:").partition(":")
-        given = ("--host", host, "--socket-port", port, "--diameter-mm", "10", "--diameter-mm", "40")
+        reach = ("--host", host, "--socket-port", port, "--model", "2F-140")
+        given = (*reach, "--diameter-mm", "10", "--diameter-mm", "40")
         calibration = ("calibrate", "gripper", *given, "--out", str(tmp_path / "gripper.yaml"))
         with lock_gripper("localhost", int(port)), Process(*calibration) as calibrate:
             status, _, refused = calibrate.end()
@@ -257,7 +258,8 @@ def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number
     """They would go on by themselves, onto a hand that reaches for what stopped."""
     with Process("emulate", "gripper-socket", "--port", "0", "--speed", "3") as emulated:
         host, _, port = emulated.hear("127.0.0.1:").partition(":")
-        given = ("--diameter-mm", "10", "--diameter-mm", "40", "--out", str(tmp_path / "gripper.yaml"))
+        diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
+        given = ("--model", "2F-140", *diameters, "--out", str(tmp_path / "gripper.yaml"))
         command = [*SHEARLOOP, "calibrate", "gripper", "--host", host, "--socket-port", port, *given]
         if program == "commission":
             command = [sys.executable, "-c", COMMISSIONING, host, port]
@@ -310,9 +312,12 @@ def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(t
             "load --port /dev/none --mass-g 1 --lever-arm-mm 0.035 --out l.yaml",
             "0.035 is not a number from 1 to 1000 mm",
         ),
-        ("gripper --port /dev/none --diameter-mm 0.02 --out g.yaml", "0.02 is not a number from 1 to 140 mm"),
-        ("gripper --port /dev/none --diameter-mm 20 --out g.yaml", "two different"),
-        ("gripper --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
+        (
+            "gripper --model 2F-140 --port /dev/none --diameter-mm 0.02 --out g.yaml",
+            "0.02 is not a number from 1 to 140 mm",
+        ),
+        ("gripper --model 2F-140 --port /dev/none --diameter-mm 20 --out g.yaml", "two different"),
+        ("gripper --model 2F-140 --port /dev/none --diameter-mm 2 --diameter-mm 4 --out g.yaml", "/dev/none"),
     ],
 )
 def test_a_mistake_ends_in_one_sentence(arguments, said, tmp_path, mistake, monkeypatch):

@@ -14,7 +14,8 @@ from typing import NamedTuple, Self
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, load_daemon_config
+from shearloop.daemon.commissioning import knows_tool
+from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, GripperConfig, load_daemon_config
 from shearloop.daemon.rig import configured_settings
 from shearloop.daemon.running_rig import EMULATED
 from shearloop.drivers.errors import DriverError
@@ -88,6 +89,8 @@ def examine(
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
         yield from check_cap(config)
+    if config.gripper is not None and not config.emulated:
+        yield from check_gripper_model(config, config.gripper)
     yield from check_daemon_and_devices(config, config_path, seconds)
 
 
@@ -247,6 +250,19 @@ def check_cap(config: DaemonConfig) -> Iterator[Finding]:
     else:
         cap = commissioning.cap
         yield note("commissioning", cap.cause, "an experiment that asks for more is refused", cap.cure)
+
+
+def check_gripper_model(config: DaemonConfig, gripper: GripperConfig) -> Iterator[Finding]:
+    """Name a model that no measurement confirms: measured widths of another model are refused."""
+    try:
+        settings = configured_settings(config)
+        commissioning = commissioning_of(config, settings) if settings is not None else None
+    except (DriverError, UserError):
+        commissioning = None
+    if not knows_tool(None, config, commissioning):
+        found = f"a {gripper.model}, by the configuration alone"
+        means = "of another model every width and every force is wrong, and no gripper says which model it is"
+        yield note("gripper's model", found, means, "compare its type plate, or run `shearloop calibrate gripper`")
 
 
 def check_bank(name: str, fingertip: FingertipConfig, geometry: GivenGeometry | None = None) -> Finding:

@@ -122,12 +122,12 @@ def test_width_round_trips_within_half_a_count(opened, closed, width):
 def test_gauges_give_the_line_they_were_measured_on_and_its_scatter():
     truth = WidthCalibration(open_counts=5.0, open_mm=140.0, closed_counts=225.0, std_mm=1.0)
     gauges = [(truth.closed_counts + width / truth.mm_per_count, width) for width in (10.0, 20.0, 30.0, 40.0)]
-    found = fit_width(gauges)
+    found = fit_width(gauges, "2F-140")
     assert [found.width_mm(counts) for counts in (0, 100, 255)] == pytest.approx(
         [truth.width_mm(counts) for counts in (0, 100, 255)]
     )
     assert found.std_mm == pytest.approx(140 / 220)
-    off = fit_width([(counts + (2 if width == 20 else 0), width) for counts, width in gauges])
+    off = fit_width([(counts + (2 if width == 20 else 0), width) for counts, width in gauges], "2F-140")
     # A bump of 2 counts in the second of four even points leaves 2² (1 − 1/4 − 1/20), over two degrees of freedom, and
     # tilts the line by 2 · (−5 mm) / 500 mm².
     assert off.std_mm == pytest.approx(2 * (0.7 / 2) ** 0.5 / (220 / 140 + 0.02))
@@ -176,8 +176,20 @@ def test_an_object_that_does_not_fit_between_the_fingers_is_refused():
 
 def test_diameters_in_centimetres_are_refused():
     gauges = [(round(Fingers(MODELS["2F-140"]).counts(width)), width / 10) for width in (10.0, 20.0, 30.0)]
-    with pytest.raises(DeviceCalibrationError, match=r"moved 9\.\d times as far as a 2F-140 does"):
-        fit_width(gauges)
+    with pytest.raises(DeviceCalibrationError, match=r"10\.\d times as far as a 2F-140 does for these diameters: "):
+        fit_width(gauges, "2F-140")
+
+
+@pytest.mark.parametrize("model", sorted(MODELS))
+@pytest.mark.parametrize("named", sorted(MODELS))
+def test_gauges_of_another_model_than_the_named_one_are_refused(model, named):
+    """A Hand-E passed as a 2F-140: its widths were right between the gauges, and every force was of the other model."""
+    gauges = [(round(Fingers(MODELS[model]).counts(width)), width) for width in (10.0, 20.0, 40.0)]
+    if model == named:
+        assert fit_width(gauges, named).model == named
+        return
+    with pytest.raises(DeviceCalibrationError, match=f"as a {named} does for these diameters, .* like a {model}"):
+        fit_width(gauges, named)
 
 
 @pytest.mark.parametrize("model", sorted(MODELS))
@@ -204,7 +216,7 @@ def test_counts_of_speed_and_force_are_those_of_the_model(model):
 )
 def test_gauges_that_make_no_line_are_refused(gauges, said):
     with pytest.raises(DeviceCalibrationError, match=said):
-        fit_width(gauges)
+        fit_width(gauges, "2F-140")
 
 
 def test_pymodbus_logs_nothing():

@@ -56,7 +56,7 @@ def write_rig(folder: Path, host: str, **content: object) -> Path:
         "load_cell": {"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
         "fingertips": {"right": {**right, "frame_period_s": 0.5412 / SPEED}},
         "robot": "ur.yaml",
-        "gripper": {"socket": {"host": host}},
+        "gripper": {"model": "2F-140", "socket": {"host": host}},
         **content,
     }
     path = folder / "rig.yaml"

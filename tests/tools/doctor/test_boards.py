@@ -302,7 +302,7 @@ async def test_a_gripper_that_is_not_activated_moves_before_its_next_motion_and_
     await server.restore()
     path = tmp_path / "rig.yaml"
     cell = {"device": {"path": str(tmp_path / "absent")}}
-    gripper = {"socket": {"host": "127.0.0.1", "port": server.port}}
+    gripper = {"model": "Hand-E", "socket": {"host": "127.0.0.1", "port": server.port}}
     robot_at("127.0.0.9", tmp_path)
     path.write_text(yaml.safe_dump({"load_cell": cell, "robot": "ur.yaml", "gripper": gripper}))
     try:

@@ -10,6 +10,7 @@ from typing import Any
 from unittest.mock import Mock
 
 import pytest
+import yaml
 
 from shearloop.cli import main
 from shearloop.cli.emulator_processes import check_emulators
@@ -17,6 +18,8 @@ from shearloop.daemon.config import CurveConfig, SerialDevice, load_daemon_confi
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.running_rig import RunningRig
+from shearloop.drivers.calibration_files import save_calibration
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.tools import doctor, serial_ports
 from shearloop.tools.doctor import devices
 from shearloop.tools.doctor.boards import check_port
@@ -39,7 +42,7 @@ def rig_config(config, tiny_bank, tmp_path) -> Path:
         fingertips={"right": {"device": device, "bank": str(tiny_bank), "frame_period_s": 0.5412 / SPEED}},
         load_cell={"device": {"path": "load-cell"}, "rate_hz": 5.0},
         robot="ur.yaml",
-        gripper={"socket": {"host": HOST}},
+        gripper={"model": "2F-140", "socket": {"host": HOST}},
     )
 
 
@@ -83,6 +86,20 @@ async def test_this_configurations_daemon_reports_on_its_devices(rig_config, mon
     found = await examined(rig_config, 0.1)
     assert found["daemon"].state == found["task robot"].state == "good"
     assert "port of right" not in found
+
+
+@pytest.mark.parametrize("calibrated", [False, True])
+async def test_a_model_that_no_measured_width_confirms_is_named(rig_config, calibrated, tmp_path):
+    if calibrated:
+        save_calibration(tmp_path / "gripper.yaml", WidthCalibration.nominal("2F-140"))
+        content = yaml.safe_load(rig_config.read_text())
+        content["gripper"]["calibration"] = "gripper.yaml"
+        rig_config.write_text(yaml.safe_dump(content))
+    found = await examined(rig_config, 0.1)
+    assert ("gripper's model" in found) is not calibrated
+    if not calibrated:
+        assert found["gripper's model"].found == "a 2F-140, by the configuration alone"
+        assert "type plate" in found["gripper's model"].next_step
 
 
 async def test_a_daemon_that_hangs_is_not_taken_for_none(rig_config, monkeypatch):

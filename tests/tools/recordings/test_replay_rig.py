@@ -172,7 +172,7 @@ def test_recordings_of_three_experiments_and_a_tare(speed, config, files, tmp_pa
         combined={"calibration": str(files["both"])},
         load_cell={"device": {"path": "load-cell"}, "rate_hz": speed / LOAD_PERIOD_S},
         robot="ur.yaml",
-        gripper={"socket": {"host": HOST}},
+        gripper={"model": "2F-140", "socket": {"host": HOST}},
         loop={"disagreement_nm": 0.2, "max_innovation_nm": 0.3},
         recording={"folder": str(tmp_path / "recordings")},
     )

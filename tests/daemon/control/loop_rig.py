@@ -100,6 +100,8 @@ class Rig:
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
             value = torque_nm + float(self.random.normal(0.0, 0.0005))
             self.control_loop.on_torque(TorqueSample("load_cell", value, "", now - 1_000_000, now))
+        if self.tick % 5 == 0 and "wrench" in self.control_loop.sources:
+            self.control_loop.on_torque(TorqueSample("wrench", torque_nm, "", now, now))
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripStep):

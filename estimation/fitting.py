@@ -36,13 +36,16 @@ from shearloop.estimation.learned_frames import LearnedFrames
 from shearloop.estimation.load_delay import LoadTiming, measure_timing, torque_bounds
 from shearloop.estimation.ridge import CensoredRidge, sign_of_loads
 from shearloop.estimation.series import FrameSeries, check_finite, distinct
-from shearloop.estimation.session import Session
+from shearloop.estimation.session import AMBIGUOUS, Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
 from shearloop.estimation.validator_fit import GripParts, fit_validator, too_few_frames
 from shearloop.estimation.values import GripState, Measured
-from shearloop.words import counted
+from shearloop.words import CountedReasons, counted
 
+# Why a frame that is gripped and undisturbed is not fitted.
+_NO_ONE_POSITION = f"{AMBIGUOUS[0]}: build a bank whose grid of k and sigma is that of this fingertip"
+_NO_TRUE_TORQUE = "no torque was measured at the time of a frame"
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
 # Fraction of a recording's frames below its released torque, and the penalty while tools are compared.
@@ -159,9 +162,9 @@ def _fit_outputs(
 ) -> Calibration:
     """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
     matcher = calibration.matcher(physics.bank)
-    rows = _replay(calibration, matcher, recordings)
+    rows, against = _replay(calibration, matcher, recordings)
     if rows is None:
-        raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
+        raise CalibrationError(f"no frame of the recordings can be calibrated on: {_most_frequent(against)}")
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
@@ -273,15 +276,15 @@ def adapt(
     check_finite(recordings)
     recordings = [recording.select_sides(calibration.sides) for recording in recordings]
     first_frames = first_frames or [0] * len(recordings)
-    rows = _replay(calibration, matcher, recordings)
+    rows, against = _replay(calibration, matcher, recordings)
     if rows is not None:
         is_first = first_twists(rows.torque_nm, rows.grip)
         count = rows.frame >= np.array(first_frames)[rows.recording]
         rows, is_first = rows.where(count), is_first[count]
     if rows is None or not len(rows.frame):
         raise CalibrationError(
-            "no frame is gripped and undisturbed for long enough; `shearloop evaluate` lists the reasons; "
-            "twist the gripped tool again"
+            f"no frame can be adapted on: {_most_frequent(against)}; `shearloop evaluate` lists the reasons; twist the "
+            "gripped tool again"
         )
     for number, recording in enumerate(recordings):
         name = names[number] if names else f"recording {number + 1} of {len(recordings)}"
@@ -306,9 +309,12 @@ def _check_new(learned: LearnedFrames, recording: FrameSeries, frames: IntArray,
 
 def _replay(
     calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
-) -> CalibrationRows | None:
-    """Return the frames that an estimate would be made of, processed as in a session; None without any."""
-    estimator, rows, grip = calibration.estimator, [], 0
+) -> tuple[CalibrationRows | None, CountedReasons]:
+    """Return the frames that an estimate would be made of, processed as in a session, and why the others are none.
+
+    The frames are None without any.
+    """
+    estimator, rows, grip, against = calibration.estimator, [], 0, CountedReasons()
     for recording, series in enumerate(recordings):
         session = Session(calibration, matcher=matcher, period_s=series.period_s)
         grip, before = grip + 1, GripState.NONE
@@ -319,9 +325,11 @@ def _replay(
                 grip += 1
             before = processed.grip
             if processed.reasons or not np.isfinite(truth[0]):
+                against.add(processed.reasons[0] if processed.reasons else _NO_TRUE_TORQUE)
                 continue
             reading = Reading.of(processed, t_s, matcher)
             if reading.is_ambiguous:
+                against.add(_NO_ONE_POSITION)
                 continue
             # Before the gel was seen idle, its position means nothing, and so the frame shows no diameter.
             torque_nm, diameter_mm = truth if processed.has_baseline else (truth[0], np.nan)
@@ -331,4 +339,12 @@ def _replay(
                 for difference in (processed.difference, processed.mean_difference)
             )
             rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, torque_nm, diameter_mm, grip))
-    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None
+    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None, against
+
+
+def _most_frequent(against: CountedReasons) -> str:
+    """Return what refuses most frames that are gripped, with their number; else what refuses most of all."""
+    counts = against.most_frequent_first
+    gripped = [(count, why) for count, why in counts if why in (_NO_ONE_POSITION, _NO_TRUE_TORQUE)]
+    count, why = (gripped or counts)[0]
+    return f"{why} ({count} of {counted(against.total, 'frame')})"

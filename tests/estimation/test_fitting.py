@@ -112,5 +112,18 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_nothing_is_fitted():
     whole = twisting(tips=(1,))
     number = np.arange(len(whole.t_s))
     half = kept(whole, number % 5 % 2 == 0)
-    with pytest.raises(CalibrationError, match="no frame of the recordings is gripped and undisturbed"):
+    with pytest.raises(CalibrationError, match=r"no frame of the recordings can be calibrated on: .* \(\d+ of"):
         fit("motion_regression", [replace(half, period_s=0.54)], "rig", timing=TRUSTED)
+
+
+def test_a_bank_in_which_no_frame_has_one_position_is_named_as_the_cause(monkeypatch, bank):
+    """It was said that no frame was gripped and undisturbed for long enough, though hundreds were."""
+
+    class TwoPositions:
+        def match(self, _difference):
+            return BankMatch(9.0, 1.0, 0.1, 0.9, 0.9, ambiguous=True)
+
+    monkeypatch.setattr(BankEstimator, "prepare", classmethod(lambda cls, material: cls(material.scale)))
+    monkeypatch.setattr(BankEstimator, "matcher", lambda *_: TwoPositions())
+    with pytest.raises(CalibrationError, match=r"two positions of the bank.* fit the frame equally well.* \(\d{2,} of"):
+        fit("bank", [twisting(tips=(1,))], "rig", Physics(bank=bank), timing=TRUSTED)

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
 
 # A torque within this fraction of the set point counts as held.
 BAND = 0.10
+# A smaller band is within the noise of every torque.
+SMALLEST_BAND_NM = 0.001
+# A spread below this fraction of the half interval is none: friction hides how the torque moved.
+LEAST_SPREAD = 0.2
 # A torque has recovered from a disturbance when it stays in the band for this time.
 STAYS_S = 1.0
 # Topics with a torque.
@@ -41,16 +45,26 @@ _Events: TypeAlias = Sequence[tuple[int, str]]
 
 @dataclass(frozen=True, slots=True)
 class TorqueSeries:
-    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,). `half_ns` is half the acquisition of one torque."""
+    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,). `half_ns` is half the acquisition of one torque.
+
+    `bounds_nm` (n, 2) are the ends of the interval of each torque; None for a source without intervals.
+    """
 
     t_ns: FloatArray
     torque_nm: FloatArray
     half_ns: float = 0.0
+    bounds_nm: FloatArray | None = None
 
     def between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
         """Return the torques whose middle is within a time interval."""
         inside = (self.t_ns >= from_ns) & (self.t_ns <= to_ns)
-        return TorqueSeries(self.t_ns[inside], self.torque_nm[inside], self.half_ns)
+        bounds_nm = self.bounds_nm[inside] if self.bounds_nm is not None else None
+        return TorqueSeries(self.t_ns[inside], self.torque_nm[inside], self.half_ns, bounds_nm)
+
+    @property
+    def half_width_nm(self) -> float:
+        """The mean half width of the intervals; 0 without intervals."""
+        return 0.0 if self.bounds_nm is None else 0.5 * float(np.diff(self.bounds_nm).mean())
 
     def acquired_between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
         """Return the torques whose whole acquisition is within a time interval."""
@@ -96,7 +110,8 @@ class _Run:
     hold_reasons: Counter[str] = field(default_factory=Counter)
     # By source, why a torque was not valid.
     invalid: defaultdict[str, CountedReasons] = field(default_factory=lambda: defaultdict(CountedReasons))
-    torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
+    # By source, time in ns, torque and the ends of its interval, NaN without one, in N·m.
+    torques: dict[str, list[tuple[int, float, float, float]]] = field(default_factory=dict)
     # By source, the times in ns of all torques, also of those that are not valid.
     times_ns: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))
 
@@ -182,7 +197,9 @@ def _on_sample(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
     if topic in TORQUES:
         run.times_ns[source].append(content["t_mono_ns"])
     if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
-        run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
+        low_nm, high_nm = (content.get(f"torque_{end}_nm") for end in ("low", "high"))
+        bounds_nm = (np.nan, np.nan) if low_nm is None or high_nm is None else (low_nm, high_nm)
+        run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"], *bounds_nm))
     elif topic in TORQUES and not content.get("valid", True):
         run.invalid[source].add(content["reason"])
 
@@ -202,8 +219,11 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
     if run.steps:
         run.steps[-1].to_ns = now_ns
     if content["phase"] in _ENDS:
+        if content["phase"] == "done":
+            _add_passed(run, content["steps"] + 1, now_ns)
         return
     if not run.steps or run.steps[-1].number != content["step"]:
+        _add_passed(run, content["step"], now_ns)
         run.steps.append(_StepSummary(content["step"], content["step_name"], now_ns, now_ns))
     step = run.steps[-1]
     step.holds = max(step.holds, content["hold"])
@@ -221,6 +241,12 @@ def _update(run: _Run, content: Mapping[str, Any]) -> None:
         run.identified = f"   {', '.join(named)}"
 
 
+def _add_passed(run: _Run, next_number: int, now_ns: int) -> None:
+    """Add the steps that took no time, such as `wait: 0`: no message speaks of them."""
+    while run.steps and run.steps[-1].number + 1 < next_number:
+        run.steps.append(_StepSummary(run.steps[-1].number + 1, "at once", now_ns, now_ns))
+
+
 def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[str]:
     done = run.last["phase"] == "done"
     took_s, asked_for = _elapsed_s(run.first, run.last), _was_asked_for(run.last)
@@ -234,14 +260,18 @@ def _lines(run: _Run, truth: TorqueSeries | None, events: _Events) -> Iterator[s
     if not done:
         # The cause alone: the message has every reason.
         yield f"  {run.last['activity'] if asked_for else run.last['cause'] or run.last['activity']}"
+    before_nm: float | None = None
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        details = {"identify": run.identified, "twist": f"   {counted(step.holds, 'angle')} held"}.get(step.name, "")
+        held = f"   {counted(step.holds, 'angle')} held" if step.holds else ""
+        details = {"identify": run.identified, "twist": held}.get(step.name, "")
         paused = f"   {step.paused_s:.1f} s of them paused" if step.paused_s else ""
         yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{paused}{details}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
-            yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
+            changes = step.set_point_nm != before_nm
+            yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here, changes=changes)
+        before_nm = step.set_point_nm
         if step.name == "tighten":
             yield from _turned(step, run, truth)
     if run.torque_note:
@@ -276,34 +306,42 @@ def _named(driving: str, truth: TorqueSeries | None) -> str:
 def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
     sources: dict[str, TorqueSeries] = {}
     for name, values in run.torques.items():
-        t_ns, torque_nm = map(np.array, zip(*values, strict=True))
+        t_ns, torque_nm, low_nm, high_nm = map(np.array, zip(*values, strict=True))
+        bounds_nm = np.stack((low_nm, high_nm), axis=1)
         # A sensor acquires all the time: the acquisition of one torque takes one period.
         periods_ns = np.diff(run.times_ns[name])
         half_ns = 0.5 * float(np.median(periods_ns)) if periods_ns.size else 0.0
-        sources[name] = TorqueSeries(t_ns, torque_nm, half_ns)
+        sources[name] = TorqueSeries(t_ns, torque_nm, half_ns, None if np.isnan(bounds_nm).any() else bounds_nm)
     return sources if truth is None else {TRUE: truth, **sources}
 
 
 def _held(
-    step: _StepSummary, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, events: _Events
+    step: _StepSummary,
+    set_nm: float,
+    from_ns: int,
+    run: _Run,
+    truth: TorqueSeries | None,
+    events: _Events,
+    *,
+    changes: bool,
 ) -> Iterator[str]:
+    """Yield the lines of a hold; `changes`: its set point is another one than of the step before."""
+    has_band = BAND * abs(set_nm) >= SMALLEST_BAND_NM
     driving, held_s = run.first["torque_source"], (step.to_ns - from_ns) / 1e9
     sources = _all_torques(run, truth)
-    yield f"    set point {_torque(set_nm, '+.3f')}, held for {held_s:.0f} s; {_named(driving, truth)}"
+    form = "+.3f" if has_band or not set_nm else "+.2g"
+    yield f"    set point {_torque(set_nm, form)}, held for {held_s:.0f} s; {_named(driving, truth)}"
     for name, series in sources.items():
-        held = series.acquired_between(from_ns, step.to_ns).torque_nm
-        if held.size:
-            near = np.mean(_in_band(held, set_nm))
-            # A band around 0 would have no width.
-            within = f", within ± {BAND:.0%} for {near:.0%} of the time" if set_nm else ""
-            mean = f"    {name:<11} {_torque(held.mean(), '+.4f')} on average"
-            yield f"{mean}, standard deviation {held.std():.4f}{within}"
+        held = series.acquired_between(from_ns, step.to_ns)
+        if held.torque_nm.size:
+            yield f"    {name:<11} {_spread(held, set_nm if has_band else None)}"
     # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
-    names = sorted(set(sources) - {driving}, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
+    judges = (name for name in sources if name != driving and sources[name].half_width_nm <= BAND * abs(set_nm))
+    names = sorted(judges, key=lambda name: (name != TRUE, name != LOAD_CELL, name))
     for name in names[:1]:
         during = sources[name].acquired_between(step.from_ns, step.to_ns)
         reached_s = recovered_s((during.t_ns - step.from_ns) / 1e9, during.torque_nm, set_nm)
-        if reached_s < np.inf:
+        if reached_s < np.inf and has_band and changes:
             yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {name}"
         for t_ns, description in events:
             # The next disturbance has a line of its own.
@@ -316,7 +354,21 @@ def _held(
                 back = never if back_s == np.inf else f"back within ± {BAND:.0%} after {back_s:.1f} s"
                 since_s = (t_ns - from_ns) / 1e9
                 off = f"    disturbed after {since_s:.1f} s ({description}): {_torque(worst_nm, '.3f')} off"
-                yield f"{off}, {back}" if set_nm else off
+                yield f"{off}, {back}" if has_band else off
+
+
+def _spread(held: TorqueSeries, set_nm: float | None) -> str:
+    """Return the mean, the interval and the spread of a held torque; without a set point, nothing of its band."""
+    torque_nm, half_nm = held.torque_nm, held.half_width_nm
+    parts = [f"{_torque(torque_nm.mean(), '+.4f')} on average"]
+    if held.bounds_nm is not None:
+        low_nm, high_nm = held.bounds_nm.mean(axis=0)
+        parts.append(f"its interval is {low_nm:+.4f} to {high_nm:+.4f}")
+    if torque_nm.std() >= LEAST_SPREAD * half_nm:
+        parts.append(f"standard deviation {torque_nm.std():.4f}")
+    if set_nm is not None and half_nm <= BAND * abs(set_nm):
+        parts.append(f"within ± {BAND:.0%} for {np.mean(_in_band(torque_nm, set_nm)):.0%} of the time")
+    return ", ".join(parts)
 
 
 def _in_band(torque_nm: FloatArray, set_nm: float) -> NDArray[np.bool_]:

@@ -440,5 +440,7 @@ def _angle(angle_rad: float) -> str:
 
 
 def _duration(seconds: float) -> str:
+    if 0.0 < seconds < 1.0:
+        return f"{max(seconds, 0.1):.1f} s"
     minutes, rest = divmod(round(seconds), 60)
     return f"{minutes} min {rest:02} s" if minutes else f"{rest} s"

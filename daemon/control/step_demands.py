@@ -43,8 +43,8 @@ class Demand(NamedTuple):
         return self.stands_s + self.moves_s
 
 
-# The wrist slows down as it comes near an angle. At the default bandwidth this adds 0.3 s to a turn at 0.1 rad/s, and
-# 0.7 s to one at 0.5 rad/s.
+# The wrist slows down as it comes near an angle or a torque. At the default bandwidth this adds 0.3 s to a turn at
+# 0.1 rad/s, and 0.7 s to one at 0.5 rad/s.
 SETTLES_S: Final = 0.5
 
 
@@ -101,7 +101,8 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
         case HoldTorqueStep(torque_nm=torque_nm):
             # An unknown torque counts as none.
             ramped_nm = abs(step.signed_torque_nm - (before.tool.torque_nm.exact or 0.0))
-            return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=ramped_nm / step.ramp_nm_per_s)
+            moves_s = ramped_nm / step.ramp_nm_per_s + (SETTLES_S if ramped_nm else 0.0)
+            return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=moves_s)
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
             speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
             return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)

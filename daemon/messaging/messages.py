@@ -148,6 +148,8 @@ class SkinShear(Message):
     shear_low_n: float | None = column("N", "lower end of the interval: 95 %, plus the range that friction leaves open")
     shear_high_n: float | None = column("N", "upper end of the interval")
     torque_nm: float | None = column("N·m", "shear force times the tool's radius; nil if that is not configured")
+    torque_low_nm: float | None = column("N·m", "lower end of its interval")
+    torque_high_nm: float | None = column("N·m", "upper end of its interval")
     response: float | None = column("", "normalised response: change of gauge 1 minus change of gauge 2")
     response_1: float | None = column("", "relative change of gauge 1 since its zero")
     response_2: float | None = column("", "relative change of gauge 2 since its zero")

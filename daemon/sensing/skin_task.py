@@ -205,6 +205,8 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
         shear_low_n=interval.low_n if interval is not None else None,
         shear_high_n=interval.high_n if interval is not None else None,
         torque_nm=torque.torque_nm if torque is not None else None,
+        torque_low_nm=interval.low_n * radius_m if interval is not None and radius_m is not None else None,
+        torque_high_nm=interval.high_n * radius_m if interval is not None and radius_m is not None else None,
         response=reading.response,
         response_1=reading.response_1,
         response_2=reading.response_2,

@@ -244,8 +244,15 @@ def test_the_duration_knows_what_the_steps_before_have_left():
     file = ExperimentFile.model_validate({"name": "one", "steps": [turn, GRIP, twist, hold, back, GRIP, hold]})
     durations_s = [step.duration_s for step in plan_of(file).steps]
     assert durations_s[2] == pytest.approx(2 * (0.05 + 0.25) / 0.1 + 4 * 0.5)
-    assert durations_s[3:5] == pytest.approx([12 + 0.08 / 0.04, 12 + 0.13 / 0.04])
+    # Each torque is come near to.
+    assert durations_s[3:5] == pytest.approx([12 + 0.08 / 0.04 + 0.5, 12 + 0.13 / 0.04 + 0.5])
     assert durations_s[6] == durations_s[3]
+
+
+def test_a_step_that_takes_less_than_a_second_does_not_take_none():
+    ramp = {"do": "hold_torque", "torque_nm": 0.1, "ramp_nm_per_s": 1, "hold_s": 0}
+    (step,) = plan_of(ExperimentFile.model_validate({"name": "quick", "steps": [ramp]})).steps
+    assert "about 0.6 s" in next(iter(step.sentences()))
 
 
 GRIP = {"do": "grip", "width_mm": 5, "force_n": 60}

@@ -197,6 +197,56 @@ def test_the_summary_shows_the_operators_pause_beside_the_steps_duration():
     assert "hold_torque    34.0 s   6.3 s of them paused" in text
 
 
+def skin_that_does_not_move(set_nm: float, half_nm: float) -> list[dict[str, Any]]:
+    """Return what a skin says whose friction hides each change, beside a load cell that follows the set point."""
+    told = []
+    for t_s in np.arange(10.0, 40.0, 0.5):
+        shear = {"torque_nm": set_nm, "torque_low_nm": set_nm - half_nm, "torque_high_nm": set_nm + half_nm}
+        told.append({"source": "skin", "t_mono_ns": round(t_s * S), "valid": True, **shear})
+    return told
+
+
+def test_a_torque_whose_interval_is_wider_than_its_spread_has_no_spread_and_judges_nothing():
+    """The skin's torque stays the same within its friction band: it was said to be within ± 10 % for 100 %."""
+    told = [loop_state(10), loop_state(12, hold=1), *skin_that_does_not_move(0.1, 0.02)]
+    text = summary_of(*told, loop_state(40, phase="done"))
+    assert "skin        +0.1000 N·m on average, its interval is +0.0800 to +0.1200\n" in text
+    assert "by skin" not in text
+    narrow = [loop_state(10), loop_state(12, hold=1), *skin_that_does_not_move(0.1, 0.001)]
+    assert "within ± 10% for 100% of the time" in summary_of(*narrow, loop_state(40, phase="done"))
+
+
+def test_a_set_point_that_stays_is_not_said_to_have_changed():
+    truth = TorqueSeries(np.arange(0.0, 60.0, 0.1) * S, np.full(600, 0.1))
+    states = [loop_state(10, step=1), loop_state(12, step=1, hold=1), loop_state(30, step=2), loop_state(31, hold=1)]
+    again = summary_of(*states, loop_state(50, phase="done", steps=2), truth=truth)
+    assert again.count("after the set point changed") == 1
+    other = [*states[:2], *(loop_state(one["t_mono_ns"] / S, hold=one["hold"], set_point_nm=0.2) for one in states[2:])]
+    moved = TorqueSeries(truth.t_ns, np.where(truth.t_ns < 31 * S, 0.1, 0.2))
+    changed = summary_of(*other, loop_state(50, phase="done", steps=2), truth=moved)
+    assert changed.count("after the set point changed") == 2
+
+
+def test_a_set_point_within_the_noise_has_no_band_and_is_not_zero():
+    truth = TorqueSeries(np.arange(0.0, 60.0, 0.1) * S, np.full(600, 0.001))
+    states = [loop_state(10, set_point_nm=1e-6), loop_state(12, hold=1, set_point_nm=1e-6)]
+    text = summary_of(*states, loop_state(50, phase="done", set_point_nm=1e-6), truth=truth)
+    assert "set point +1e-06 N·m" in text
+    assert "within" not in text
+
+
+def test_steps_that_take_no_time_and_angles_without_a_hold_are_told():
+    states = [loop_state(10, step=1, steps=4, step_name="twist"), loop_state(12, step=3, steps=4, step_name="release")]
+    text = summary_of(*states, loop_state(14, step=3, steps=4, phase="done"))
+    assert "angles held" not in text
+    assert re.findall(r"step (\d) of 4  (.+?)  +([\d.]+) s", text) == [
+        ("1", "twist", "2.0"),
+        ("2", "at once", "0.0"),
+        ("3", "release", "2.0"),
+        ("4", "at once", "0.0"),
+    ]
+
+
 def test_a_set_point_of_nothing_has_no_band():
     states = [loop_state(t_s, hold=1, set_point_nm=0.0) for t_s in (10, 14)]
     readings = [{"source": "right", "t_mono_ns": t_s * S, "torque_nm": 0.001, "valid": True} for t_s in range(15, 40)]

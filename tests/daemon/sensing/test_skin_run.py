@@ -111,6 +111,8 @@ async def test_a_shear_force_is_streamed_from_either_daq(tmp_path, socket):
         content = await bench.until(lambda content: content["valid"] and content["response"] > 0.0603)
         assert content["shear_low_n"] - 0.02 <= 0.8 <= content["shear_high_n"] + 0.02
         assert content["torque_nm"] == pytest.approx(content["shear_n"] * 0.015)
+        ends = [content[f"torque_{end}_nm"] / content[f"shear_{end}_n"] for end in ("low", "high")]
+        assert ends == pytest.approx([0.015, 0.015])
         assert content["response"] == pytest.approx(content["response_1"] - content["response_2"])
         assert content["r1_ohm"] == pytest.approx(24.6 * (1 + content["response_1"]), rel=1e-3)
         assert not content["deadband"]

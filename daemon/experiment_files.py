@@ -1,7 +1,8 @@
 """Reads experiments: at the desk with every mistake; for an operator's request in a thread and within bounds.
 
 Every user of this machine may send `start` with the name of a file. The daemon may have rights to read files that this
-user may not read. So a request may name only files in the configured folders, and the reply contains nothing of a file.
+user may not read. So a request may name only files in the configured folders, and the reply contains nothing of a file
+that is no experiment.
 
 A thread that parses a file blocks the event loop for some ms at a time. So the files are small, and no file is read for
 a request during a motion or the start of one (`Rig.reading_refusal`).
@@ -23,7 +24,7 @@ import structlog
 from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_check import experiment_mistakes
-from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
+from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.torques import TorqueSource
@@ -263,25 +264,38 @@ class ExperimentFiles:
             reason = error.strerror if isinstance(error, OSError) else str(error)
             meant = self._meant(named) if isinstance(error, FileNotFoundError) else ""
             raise UserError(f"{name}: the experiment cannot be read: {reason}{meant}") from error
+        content: object = None
         try:
             document = Document.parse(path, data, UserError, ExperimentFile.what)
+            content = document.content
             file = document.model(ExperimentFile)
         except UserError as error:
             structlog.get_logger().warning("the experiment is not valid", mistakes=str(error))
+            if _is_experiment(content):
+                raise _mistaken(str(error).splitlines()) from error
             raise InvalidExperimentError(
                 f"{name} is not a valid experiment; the daemon's log names each mistake"
             ) from error
         if mistakes := document.located(self._mistakes(document)):
-            # The file is an experiment, and `start` shows its plan to every user, so the reply may name a mistake.
             structlog.get_logger().warning("the rig cannot run the experiment", mistakes="\n".join(mistakes))
-            first = mistakes[0] if len(mistakes[0]) <= _LONGEST_MISTAKE else f"{mistakes[0][:_LONGEST_MISTAKE]} …"
-            others = (
-                f" (and {counted(len(mistakes) - 1, 'more mistake')}: see the daemon's log)" if mistakes[1:] else ""
-            )
-            raise InvalidExperimentError(f"{first}{others}")
+            raise _mistaken(mistakes)
         if outdated := self.loaded.why_outdated():
             raise UserError(outdated)
         return ReadExperiment(path, file, data)
+
+
+def _is_experiment(content: object) -> bool:
+    """Return whether a file's content has a step of an experiment; of any other file, a reply says nothing."""
+    steps = content.get("steps") if isinstance(content, dict) else None
+    kinds = (step.get("do") for step in steps if isinstance(step, dict)) if isinstance(steps, list) else ()
+    return any(isinstance(kind, str) and kind in STEP_KINDS for kind in kinds)
+
+
+def _mistaken(mistakes: Sequence[str]) -> InvalidExperimentError:
+    """Return the error with an experiment's first mistake: `start` shows the plan of each to every user."""
+    first = mistakes[0] if len(mistakes[0]) <= _LONGEST_MISTAKE else f"{mistakes[0][:_LONGEST_MISTAKE]} …"
+    others = f" (and {counted(len(mistakes) - 1, 'more mistake')}: see the daemon's log)" if mistakes[1:] else ""
+    return InvalidExperimentError(f"{first}{others}")
 
 
 @asynccontextmanager

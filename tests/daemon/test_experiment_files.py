@@ -179,6 +179,15 @@ async def test_a_reply_has_no_content_of_a_file(text, folder, log):
     assert log.said == ["the experiment is not valid"]
 
 
+async def test_the_first_mistake_of_an_experiment_is_told_to_its_sender(folder, log):
+    """A page and a program of one's own have no log."""
+    text = "name: one\nsteps:\n  - {do: release}\n  - {do: wait, wait_s: -1}\n  - {do: twst}\n"
+    said = await refusal(folder, write(folder / "one.yaml", text))
+    assert said.startswith(f"{folder}/one.yaml:4: steps[1].wait_s: -1 is too small")
+    assert said.endswith("(and 1 more mistake: see the daemon's log)")
+    assert log.said == ["the experiment is not valid"]
+
+
 async def test_the_event_loop_goes_on_while_a_large_file_is_read(folder):
     steps = [{"do": "wait", "wait_s": number % 7 + 0.5} for number in range(MAX_STEPS)]
     files, beats = files_in(folder), 0

@@ -38,7 +38,9 @@ MOVE_SILENCES, STOP_SILENCES = 6.0, 3.0
 SLOWEST_SCALING = 0.05
 
 NOT_OURS = (
-    "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
+    "A program runs on the robot that someone else started or resumed. It may be another daemon's, of another user or "
+    "computer, whose stop waits for its operator: look at the pendant, and for other daemons (`pgrep -af shearloop`). "
+    "End what commands the robot, then unlock to start the control program instead."
 )
 LEFT_TO_WATCHDOG = (
     "{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."

@@ -34,6 +34,11 @@ NOT_STARTING = (
     "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
     "control, and for the log's last lines. The robot's worker is started again with motion disabled."
 )
+ANOTHERS_PROGRAM = (
+    "The program that runs on the robot may be another daemon's: another client writes the robot's input registers. An "
+    "unlock would go round a stop that waits there. End the other daemon, or stop the program at the pendant, then "
+    "unlock again."
+)
 
 
 class Recovery:
@@ -54,6 +59,8 @@ class Recovery:
         self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
         self._cleared = False
+        # Whether the program that runs may be another client's; None until it was asked.
+        self._others: bool | None = None
         # When the control program was first sent.
         self._uploaded_ns: int | None = None
         # The controller's latest refusal of a request that could be done without.
@@ -110,7 +117,7 @@ class Recovery:
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
             if self.operator_asked:
-                self._ask_dashboard(now_ns, "stop")
+                self._stop_program(sample, now_ns)
             elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
                 # Not ours to stop. After the death of its daemon its watchdog would have ended it.
                 self.refusal = ""
@@ -150,6 +157,16 @@ class Recovery:
                 self._ask_dashboard(now_ns, "power on")
             elif sample.robot_mode == ROBOT_MODE_IDLE:
                 self._ask_dashboard(now_ns, "brake release")
+
+    def _stop_program(self, sample: RtdeSample, now_ns: int) -> None:
+        """Stop any program but that of another client, whose own stop may wait for its operator."""
+        if sample.program_running and self._others is None:
+            self._others = self._arm.has_other_client()
+        if not (sample.program_running and self._others):
+            self._ask_dashboard(now_ns, "stop")
+        elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
+            # The program of a worker that has ended would have ended by itself.
+            self.refusal = ANOTHERS_PROGRAM
 
     def _close_popups(self, now_ns: int) -> None:
         if self.operator_asked and "close popup" not in self._asked_ns:

@@ -54,12 +54,17 @@ def free_registers(host: str, timeout_s: float, version: str) -> ScriptRegisters
     """
     major, minor, *_ = map(int, version.split("."))
     for registers in (LOWER,) if (major, minor) >= FIRST_WITH_LOWER_ALONE else (UPPER, LOWER):
-        # A register belongs to a connection: closing it gives the register back.
-        with connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
-            agree_on_protocol(connection)
-            if b"IN_USE" not in request(connection, INPUTS, ",".join(registers.inputs).encode()):
-                return registers
+        if not are_in_use(host, timeout_s, registers):
+            return registers
     return None
+
+
+def are_in_use(host: str, timeout_s: float, registers: ScriptRegisters) -> bool:
+    """Return whether another client writes one of these input registers."""
+    # A register belongs to a connection: closing it gives the register back.
+    with connected(host, RTDE_PORT, timeout_s, "asking for its registers") as connection:
+        agree_on_protocol(connection)
+        return b"IN_USE" in request(connection, INPUTS, ",".join(registers.inputs).encode())
 
 
 def registers_in_use(host: str) -> RobotLostError:

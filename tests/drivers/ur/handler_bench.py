@@ -78,6 +78,7 @@ class FakeArm:
         self.accepts = True
         self.wrench_zero = (0.0,) * 6
         self.stops_moves = True
+        self.other_client = False
         self.unlockable = self.stoppable = True
         # The controller's words against a request: of an error, and of an answer that may be ignored.
         self.refuses: dict[str, str] = {}
@@ -113,6 +114,9 @@ class FakeArm:
 
     def read(self) -> messages.RtdeSample:
         return self.reading
+
+    def has_other_client(self) -> bool:
+        return self.other_client
 
     def take_errors(self) -> list[messages.ControllerError]:
         return []

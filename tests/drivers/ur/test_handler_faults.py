@@ -87,6 +87,19 @@ def test_resumed_program_does_not_move_and_gets_no_heartbeats():
     assert bench.ask(Unlock()).accepted
 
 
+def test_an_unlock_does_not_end_the_program_of_another_daemon_whose_stop_may_wait():
+    bench = HandlerBench()
+    bench.arm.other_client = True
+    # Another daemon keeps its program alive.
+    bench.arm.be(runtime_state=2)
+    bench.run(60)
+    reply = bench.ask(Unlock())
+    assert "may be another daemon's: another client writes the robot's input registers" in reply.refusal
+    assert bench.arm.reading.program_running
+    bench.arm.end_program()
+    assert bench.ask(Unlock()).accepted
+
+
 def test_program_left_behind_ends_before_ours_starts():
     bench = HandlerBench()
     bench.arm.be(runtime_state=2)

@@ -30,7 +30,7 @@ FREE = {
     "activity", "blocked", "by", "cap", "cause", "command", "experiment", "fault_text", "faults", "host", "instance",
     "model",
     "reason", "reasons", "refusal", "release_refusal", "rig", "source", "start_refusal", "step_name", "subject",
-    "request_id", "summary", "tare_refusal", "torque_note", "torque_source",
+    "request_id", "summary", "tare_refusal", "torque_note", "torque_source", "wrist_torque_reason",
 }  # fmt: skip
 
 

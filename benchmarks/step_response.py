@@ -22,7 +22,7 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.control.torque_controller import TorqueController
-from shearloop.daemon.run_summary import BAND
+from shearloop.daemon.summary_text import BAND
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.emulators.emulated_rig import SIDES
 from shearloop.emulators.gripper import Gripper

@@ -20,7 +20,7 @@ from shearloop.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig, EventConfig
-    from shearloop.daemon.run_summary import TorqueSeries
+    from shearloop.daemon.run_record import TorqueSeries
 
 # An emulator prints a line once its ports are open, which takes about two seconds.
 READY_S, POLL_S = 20.0, 0.02
@@ -131,7 +131,7 @@ class EmulatedDevices:
         """Return the rig's true torque so far; None if it is unknown."""
         import numpy as np
 
-        from shearloop.daemon.run_summary import TorqueSeries
+        from shearloop.daemon.run_record import TorqueSeries
 
         if self.truth is None or not self.truth.exists():
             return None

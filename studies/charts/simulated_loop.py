@@ -22,7 +22,7 @@ from shearloop.daemon.control.margins import integral_gain
 from shearloop.daemon.control.torque_controller import ControllerSettings, TorqueController, WristCommand
 from shearloop.daemon.control.wrist_controller import controller_settings
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.run_summary import BAND, recovered_s
+from shearloop.daemon.summary_text import BAND, recovered_s
 from shearloop.daemon.torques import TorqueSample, TorqueSource
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 

@@ -10,7 +10,8 @@ import pytest
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.messaging import messages
 from shearloop.daemon.messaging.messages import with_unit
-from shearloop.daemon.run_summary import RunSummary, TorqueSeries
+from shearloop.daemon.run_record import TorqueSeries
+from shearloop.daemon.run_summary import RunSummary
 
 S = 1_000_000_000
 TOPICS = {"loop": "loop.state", "robot": "robot.state", "load_cell": "load.torque", "stop": "loop.stop"}

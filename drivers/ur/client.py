@@ -241,10 +241,7 @@ class UrRobot:
                     # The restored zero ends with a tare, or with a program's start without a load.
                     self._restored_zero = (0.0,) * 6
                 self.states += 1
-                if before is None or message.measured_ns > before.measured_ns:
-                    self._measured_ns.append(message.measured_ns)
-                    while self._measured_ns[0] < message.measured_ns - _SECOND_NS:
-                        self._measured_ns.popleft()
+                self._count(message.measured_ns)
                 if self._connection is not None:
                     self._tell_held(self._connection)
                 if before is None:
@@ -267,6 +264,14 @@ class UrRobot:
                 self.monitor.noted(f"{code}: look it up in Universal Robots' list of error codes.")
             case messages.Failed():
                 raise RobotLostError(message.kind, message.sentence)
+
+    def _count(self, measured_ns: int) -> None:
+        """Count a state for the rate, once."""
+        known_ns = self._measured_ns
+        if not known_ns or measured_ns > known_ns[-1]:
+            known_ns.append(measured_ns)
+        while known_ns[0] < measured_ns - _SECOND_NS:
+            known_ns.popleft()
 
     def _use(self, settings: UrSettings) -> None:
         """Drive with these settings; raises RobotLostError, before any program is sent, if the worker has others."""

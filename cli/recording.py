@@ -150,6 +150,7 @@ def _summary_text(found: "RecordingSummary") -> str:
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
         plural = " " if topic.messages == 1 else "s"
         lines.append(f"  {name:<22} {topic.messages:>8} message{plural} {rate}".rstrip())
+    lines += _other_keys(found)
     lines += [f"  attached {name}" for name in found.attachments]
     lines += [
         f"  {step.after_s:.1f} s after the first message: {step}; the times of the recording do not follow it."
@@ -175,6 +176,19 @@ def _summary_text(found: "RecordingSummary") -> str:
         dropped = counted(found.dropped, "message was", "messages were")
         lines.append(f"  {dropped} dropped because the disk was too slow.")
     return "\n".join(lines)
+
+
+def _other_keys(found: "RecordingSummary") -> list[str]:
+    """Return a line for each topic whose keys are not those of this version."""
+    lines = []
+    for name, topic in found.topics.items():
+        if topic.not_recorded:
+            lines.append(f"  {name} was recorded without {', '.join(topic.not_recorded)}: exports have no value there.")
+        if topic.unknown:
+            lines.append(f"  {name} was recorded with {', '.join(topic.unknown)}, which this version does not have.")
+        if topic.problem:
+            lines.append(f"  {name} cannot be read: {topic.problem}.")
+    return lines
 
 
 def _repair(args: argparse.Namespace) -> int:

@@ -3,6 +3,7 @@
 import argparse
 import asyncio
 import sys
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -53,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         comparison = asyncio.run(_replay(run, config, args))
     same_code = run.metadata.get("code_sha256") == code_digest()
     made_by = "" if same_code else run.metadata.get("software", "of an unknown version")
-    for line in _comparison_text(comparison, made_by):
+    for line in (*_other_keys_text(run, made_by), *_comparison_text(comparison, made_by)):
         print(line, file=sys.stderr)
     if args.json:
         counts = {"compared": comparison.compared, "different": comparison.different}
@@ -65,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
             "examples": comparison.examples,
             "dropped_at_opening": comparison.dropped_at_opening,
             "same_code": same_code,
+            "not_recorded": run.not_recorded,
+            "left_out": run.left_out,
         }
         print_result(counts | others, (), as_json=True)
     return 1 if args.check and not comparison.passed else 0
@@ -112,6 +115,19 @@ def _publisher(context: "zmq.asyncio.Context", args: argparse.Namespace, clock: 
         raise UserError(
             f"{error}: give another one with `--publish`, such as --publish tcp://127.0.0.1:7771"
         ) from error
+
+
+def _other_keys_text(run: "RecordedRun", made_by: str) -> list[str]:
+    """Return what to print of a recording whose messages have other keys than this version's."""
+
+    def named(topics: Mapping[str, Sequence[str]]) -> str:
+        return "; ".join(f"{', '.join(keys)} of {topic}" for topic, keys in topics.items())
+
+    other = f"Other code (shearloop {made_by}) made the recording"
+    lines = [f"{other} without {named(run.not_recorded)}: no value is sent there."] if run.not_recorded else []
+    if run.left_out:
+        lines.append(f"{other} with {named(run.left_out)}: this version does not have that, and leaves it out.")
+    return lines
 
 
 def _comparison_text(comparison: "ReplayComparison", made_by: str) -> list[str]:

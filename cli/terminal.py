@@ -256,7 +256,7 @@ def loop_line(content: Mapping[str, Any]) -> str:
         return f"{content['phase']}: {cause}" if cause else str(content["phase"])
     step = f"step {content['step']} of {content['steps']} {content['step_name']}"
     activity, stopped = content["activity"] or content["experiment"], content["phase"] == "stopped"
-    percent = "" if stopped else f" {100 * content['progress']:.0f} %"
+    percent = "" if stopped or content["progress"] is None else f" {100 * content['progress']:.0f} %"
     # After a stop the activity is its reasons. A narrow terminal cuts the end.
     cause = cause or (activity if stopped else "")
     parts = (f"{content['phase']}{percent}{f': {cause}' if cause else ''}", step, activity)
@@ -266,7 +266,7 @@ def loop_line(content: Mapping[str, Any]) -> str:
 def _health(topic: str, content: Mapping[str, Any]) -> str:
     from shearloop.tools.task_row import task_row
 
-    rows = [task_row(name, facts) for name, facts in content["tasks"].items()]
+    rows = [task_row(name, facts) for name, facts in (content["tasks"] or {}).items()]
     tasks = (f"{name} {', '.join(filter(None, cells))}" for name, *cells in rows)
     memory, cpu = _shown(topic, content, "memory_mb", ".0f"), _shown(topic, content, "cpu_percent", ".1f")
     return f"{memory}  {cpu} CPU  " + "; ".join(tasks)

@@ -228,8 +228,8 @@ def _message_schema(topic: str) -> dict[str, Any]:
     hints = typing.get_type_hints(TOPICS[topic])
     for item in dataclasses.fields(TOPICS[topic]):
         unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
-        described = f"{meaning} ({unit})" if unit else meaning
-        properties[item.name] = {**json_type(hints[item.name]), "description": described}
+        described = {"description": f"{meaning} ({unit})", "unit": unit} if unit else {"description": meaning}
+        properties[item.name] = {**json_type(hints[item.name]), **described}
     required = [name for name in properties if name not in optional_keys(topic)]
     if topic == FRAME_TOPIC:
         properties[ARRIVAL] = {"type": "integer", "description": "arrival of the line's last byte"}

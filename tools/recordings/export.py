@@ -11,13 +11,12 @@ import numpy as np
 from pydantic_core import to_json
 from scipy.io import savemat
 
-from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError, require
 from shearloop.files import replace_file
 from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.message_content import column_units, columns
-from shearloop.tools.recordings.reader import read_messages
+from shearloop.tools.recordings.reader import columns_of_topics, read_messages
+from shearloop.tools.recordings.recorded_columns import TopicColumns
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
 
 # Numbers of a Parquet table that are written at once.
@@ -60,6 +59,7 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
             )
 
     check_new(part(2))
+    columns = columns_of_topics(path, topics)
     written: list[Path] = []
     names = _struct_names(topics)
     waiting: dict[str, Rows] = {topic: [] for topic in topics}
@@ -71,7 +71,7 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
             used = {name: topic for topic, name in names.items() if waiting[topic]}
             structs: dict[str, Mapping[str, Any]] = {name: arrays(waiting[topic]) for name, topic in used.items()}
             if used:
-                structs[_UNITS] = {name: column_units(topic) for name, topic in used.items()}
+                structs[_UNITS] = {name: columns[topic].units for name, topic in used.items()}
             target = part(len(written) + 1)
             if written:
                 check_new(target)
@@ -114,6 +114,7 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     for target in (paths | units).values():
         check_link("--out", target)
         check_apart("--out", target, [(f"the recording {path}", path)])
+    columns = columns_of_topics(path, topics)
     tables: dict[str, _CsvTable | _ParquetTable] = {}
     with new_folder(out), ExitStack() as files:
         for topic, content, message in read_messages(path, topics, progress):
@@ -123,13 +124,13 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
                 if form == "csv":
                     tables[topic] = _CsvTable(paths[topic], file, row)
                 else:
-                    tables[topic] = _ParquetTable(files.enter_context(lent_file(file)), topic, row)
+                    tables[topic] = _ParquetTable(files.enter_context(lent_file(file)), columns[topic], row)
             tables[topic].add(row)
         # Every table ends before the first file is replaced.
         for table in tables.values():
             table.close()
         if form == "csv":
-            rows = [(topic, *unit) for topic in tables for unit in column_units(topic).items()]
+            rows = [(topic, *unit) for topic in tables for unit in columns[topic].units.items()]
             lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
             files.enter_context(replace_file(units[_UNITS])).write("".join(f"{line}\r\n" for line in lines).encode())
     return list((paths | units).values())
@@ -174,9 +175,9 @@ def _csv_cell(value: Any) -> str:
 
 
 class _ParquetTable:
-    """A table with the types of the topic's schema, written in batches; missing elements of arrays are NaN."""
+    """A table with the recorded types of a topic, written in batches; missing elements of arrays are NaN."""
 
-    def __init__(self, file: LentFile, topic: str, first: dict[str, Any]) -> None:
+    def __init__(self, file: LentFile, columns: TopicColumns, first: dict[str, Any]) -> None:
         """Begin the file with the columns of the first row."""
         import pyarrow as pa
         import pyarrow.parquet as pq
@@ -184,9 +185,9 @@ class _ParquetTable:
         names = {"number": "float64", "integer": "int64", "boolean": "bool", "string": "string", "object": "string"}
         types = {kind: pa.type_for_alias(name) for kind, name in names.items()}
         types["array"] = pa.list_(types["number"])
-        known = columns(schema.schema_name(topic))
-        kinds = {key: known[key].kind if key in known else "integer" for key in first}
-        units = {key: {"unit": unit} for key, unit in column_units(topic).items()}
+        # Only the log time is no key of a message.
+        kinds = {key: columns.all[key].kind if key in columns.all else "integer" for key in first}
+        units = {key: {"unit": unit} for key, unit in columns.units.items()}
         self._schema = pa.schema([pa.field(key, types[kind], metadata=units.get(key)) for key, kind in kinds.items()])
         self._arrays = [field.name for field in self._schema if field.type == pa.list_(pa.float64())]
         scalars = [field.name for field in self._schema if not pa.types.is_list(field.type)]
@@ -198,7 +199,7 @@ class _ParquetTable:
     def add(self, row: dict[str, Any]) -> None:
         """Add one row."""
         # Arrow takes twice as long for a list.
-        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays}
+        arrays = {key: np.array(row[key], dtype=np.float64) for key in self._arrays if row[key] is not None}
         self._rows.append(row | arrays)
         if len(self._rows) == self._rows_at_once:
             self._write()

@@ -32,6 +32,14 @@ _IDENTITY_KEYS = (
 )
 
 
+# The keys of each topic that are read. An imported message lacks some, and its file's schema has them all the same.
+_NEEDED: Mapping[str, tuple[str, ...]] = {
+    schema.FRAME_TOPIC: ("line", "frame"),
+    schema.LOAD_TOPIC: ("torque_nm", "valid"),
+    schema.INPUT: ("t_mono_ns", "kind", "data"),
+}
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class SideFrames:
     """One side's frames by rising time: t_mid_ns (n,) in Unix nanoseconds, lines (n, v) in volts.
@@ -143,6 +151,9 @@ def read_recording(path: str | Path) -> Recording:
         inputs = {schema.input_topic(side): side for side in sides.values()}
         live = bool(inputs) and recording.counts.keys() >= inputs.keys()
         periods_s = _configured_periods_s(recording.attachments().get(schema.CONFIGURATION))
+        for topic in sides.keys() | inputs.keys() | {schema.LOAD_TOPIC}:
+            if topic in recording.counts:
+                recording.columns(topic).need(topic, _NEEDED[schema.schema_name(topic)], "a fit or a judgement")
         found = _Messages(table.n_line_values)
         for channel, message in recording.messages([schema.LOAD_TOPIC, *sides, *inputs]):
             topic, t_ns = channel.topic, message.log_time

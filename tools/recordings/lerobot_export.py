@@ -28,8 +28,9 @@ from shearloop.errors import UserError, require
 from shearloop.files import replace_file
 from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.message_content import ContentError, check_length, column_units
+from shearloop.tools.recordings.message_content import check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
+from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S
@@ -67,7 +68,7 @@ _Known: TypeAlias = tuple[int, int, str, dict[str, Any], int]
 class _Held:
     """The latest message of one topic as numbers, NaN before the first."""
 
-    def __init__(self, topic: str, table: ChannelTable) -> None:
+    def __init__(self, topic: str, columns: TopicColumns, table: ChannelTable) -> None:
         live = schema.schema_name(topic)
         name, keys = _FEATURES[live]
         source = topic.removeprefix(live).removeprefix(".")
@@ -78,28 +79,43 @@ class _Held:
         for key in self._keys:
             self.names += [f"{key}_{i}" for i in range(_VECTOR)] if key in _VECTORS else [key]
         # By the keys of the message.
-        known = column_units(topic)
+        known = columns.units
         self.units = {key: known[key] for key in (self._keys or ["channels"]) if key in known}
+        self._columns = columns
         values = [0.0 if name == "valid" else np.nan for name in self.names]
         self.vector: NDArray[np.float32] = np.array(values, dtype=np.float32)
         self.measured_ns: int | None = None
 
     def hold(self, content: Mapping[str, Any], measured_ns: int) -> None:
-        """Keep a message."""
+        """Keep a message; a value that it does not have is NaN."""
+        content = self._columns.known(content)
         if self._table is not None:
-            line = np.array(content["line"], dtype=np.float64)
-            check_length("line", len(line), self._table.n_line_values)
-            vector = self._table.channels_of_line(line)
+            vector = np.full(self._table.n_channels, np.nan)
+            if content["line"] is not None:
+                line = np.array(content["line"], dtype=np.float64)
+                check_length("line", len(line), self._table.n_line_values)
+                vector = self._table.channels_of_line(line)
         else:
             # An imported torque has no `valid`, and counts as valid.
-            values = {key: np.ravel(content.get(key, key == "valid")) for key in self._keys}
-            for key, value in values.items():
-                check_length(key, len(value), _VECTOR if key in _VECTORS else 1)
-            vector = np.concatenate([values[key].astype(np.float64) for key in self._keys])
+            vector = np.concatenate([self._numbers(key, content.get(key, key == "valid")) for key in self._keys])
         # A number beyond float32 becomes infinite.
         with np.errstate(over="ignore"):
             self.vector = vector.astype(np.float32)
         self.measured_ns = measured_ns
+
+    def arrival_ns(self, content: Mapping[str, Any]) -> int:
+        """Return when a message's last byte arrived (Unix ns), 0 if it does not say so."""
+        return self._columns.known(content).get(schema.ARRIVAL) or 0
+
+    @staticmethod
+    def _numbers(key: str, value: Any) -> NDArray[np.float64]:
+        """Return the value of a key as numbers; raises ContentError for an array of another length."""
+        size = _VECTOR if key in _VECTORS else 1
+        if value is None:
+            return np.full(size, np.nan)
+        numbers = np.ravel(np.array(value, dtype=np.float64))
+        check_length(key, len(numbers), size)
+        return numbers
 
     def age_s(self, now_ns: int) -> float:
         """Return the time since the measurement, NaN without one."""
@@ -142,7 +158,8 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     require("pyarrow", "export", "a LeRobot dataset")
     with open_recording(path) as recording:
         attachments = recording.attachments()
-        held = {topic: _Held(topic, recording.table) for topic in topics if schema.schema_name(topic) in _FEATURES}
+        used = [topic for topic in topics if schema.schema_name(topic) in _FEATURES]
+        held = {topic: _Held(topic, recording.columns(topic), recording.table) for topic in used}
         try:
             configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))
         except (ValueError, RecursionError) as error:
@@ -246,7 +263,8 @@ class Dataset:
         for number, (topic, content, message) in enumerate(read_messages(path, self._held, progress)):
             if number == 0:
                 self._started_ns = message.log_time
-            known_ns = max(message.publish_time, message.log_time, content.get(schema.ARRIVAL) or 0)
+            arrival_ns = self._held[topic].arrival_ns(content)
+            known_ns = max(message.publish_time, message.log_time, arrival_ns)
             # An arrival has its own time.
             _check_length(path, self._started_ns, known_ns)
             heapq.heappush(waiting, (known_ns, number, topic, content, message.log_time))

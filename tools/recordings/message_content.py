@@ -1,68 +1,40 @@
 """The keys of a recorded message in the order of its topic's schema, each checked for its type.
 
-Exports, replay and `shearloop.read` take messages from here, so a value is always under its own name. Content that no
-recorder of this version writes is refused: an unknown or missing key, another type, integers beyond 64 bits, nested
-lists, a heatmap that is no rectangle.
+Exports, replay and `shearloop.read` take messages from here, so a value is always under its own name. Content that does
+not fit the schema of its own file is refused: an unknown or missing key, another type. So are integers beyond 64 bits,
+nested lists, and a heatmap that is no rectangle.
 """
 
 import math
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import Any, NamedTuple
 
 from pydantic_core import from_json
 
-from shearloop.daemon.messaging.messages import EitHeatmap, units
+from shearloop.daemon.messaging.messages import EitHeatmap
 from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
+from shearloop.tools.recordings.recorded_columns import Column, ContentError, TopicColumns, own_topic
 
 # Unix time and CLOCK_MONOTONIC in ns: the year 2116, and 146 years after the start of a computer.
 _LATEST_NS = 2**62
 # Frames and heatmaps have less than 1 MB, and states a few. JSON of this size is parsed within three seconds.
 _LARGEST_MESSAGE_BYTES = 16 << 20
 _LONGEST_QUOTE = 40
+# A message of a daemon has these, and an imported one has none of them.
+_LIVE_KEYS = frozenset({"source", "t_mono_ns"})
 
 
-class ContentError(ValueError):
-    """A recorded message that does not fit its topic."""
+def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -> dict[str, Any]:
+    """Return a message of a recorded topic: this version's keys in the order of its schema, then others of the file's.
 
-
-class OtherKeysError(ContentError):
-    """A recorded message with keys of another version."""
-
-
-class Column(NamedTuple):
-    """One key of a topic: its JSON type, and whether a live message has it without a value."""
-
-    name: str
-    kind: str
-    optional: bool
-
-
-@cache
-def columns(name: str) -> Mapping[str, Column]:
-    """Return the columns of a schema by their names, in its order."""
-    optional = schema.optional_keys(name)
-    described = schema.schemas()[name]["properties"].items()
-    return {key: Column(key, definition["type"], key in optional) for key, definition in described}
-
-
-@cache
-def column_units(topic: str) -> Mapping[str, str]:
-    """Return the unit of each column of a recorded topic's table that has one, as its message names it."""
-    name = schema.schema_name(topic)
-    times = dict.fromkeys(("log_time_ns", "t_mono_ns", "offset_ns", schema.ARRIVAL, schema.SUSPENDED), "ns")
-    known = {**times, **units(name)}
-    return {key: known[key] for key in ("log_time_ns", *columns(name)) if key in known}
-
-
-def read_content(topic: str, data: bytes) -> dict[str, Any]:
-    """Return a message of a recorded topic: its keys in the order of the schema, None where a value is missing.
-
-    Numbers are floats, arrays are lists of floats, integers or None. An imported message has only the keys that its
-    import writes. Raises UnknownTopicError for another topic and ContentError for what does not fit it.
+    `columns` are those of the topic in its file, without it this version's. A value that is missing, or whose key the
+    file's schema lacks, is None. Numbers are floats, arrays are lists of floats, integers or None. An imported message
+    has only the keys that its import writes. Raises UnknownTopicError for another topic and ContentError for what does
+    not fit it.
     """
     name = schema.schema_name(topic)
+    columns = columns or own_topic(name)
     if len(data) > _LARGEST_MESSAGE_BYTES:
         raise ContentError(f"it has {len(data) >> 20} MB, and at most {_LARGEST_MESSAGE_BYTES >> 20} are read")
     try:
@@ -72,21 +44,30 @@ def read_content(topic: str, data: bytes) -> dict[str, Any]:
         raise ContentError(f"it is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise ContentError(f"it is {_quoted(content)}, not a map")
-    known = columns(name)
-    imported = "source" not in content and name in schema.IMPORTED_KEYS
-    expected = schema.IMPORTED_KEYS[name] if imported else known
-    if other := [key for key in content if key not in expected]:
-        raise OtherKeysError(f"it has the unknown key {_quoted(other[0])}")
-    if missing := [key for key in expected if key not in content and not known[key].optional]:
-        raise OtherKeysError(f"it lacks the key {missing[0]!r}")
-    row = {key: _checked(known[key], content.get(key), imported=imported) for key in expected}
+    imported = name in schema.IMPORTED_KEYS and not content.keys() & _LIVE_KEYS
+    expected = [*schema.IMPORTED_KEYS[name], *columns.unknown] if imported else list(columns.all)
+    allowed = columns.recorded.keys() & {*expected}
+    if other := [key for key in content if key not in allowed]:
+        raise ContentError(f"it has the unknown key {_quoted(other[0])}")
+    lacking = (key for key in expected if key in allowed and key not in content)
+    if missing := [key for key in lacking if not columns.recorded[key].optional]:
+        raise ContentError(f"it lacks the key {missing[0]!r}")
+    row = {
+        key: _checked(columns.recorded[key], content.get(key), imported=imported) if key in allowed else None
+        for key in expected
+    }
+    _check_known(name, columns.known(row))
+    return row
+
+
+def _check_known(name: str, row: Mapping[str, Any]) -> None:
+    """Raise ContentError for values that no daemon writes, among those that this version knows."""
     for key in ("t_mono_ns", "offset_ns", schema.ARRIVAL):
         check_time(key, row.get(key) or 0)
-    if name == EitHeatmap.topic:
+    if name == EitHeatmap.topic and row["scores"] is not None and row[schema.SCORES_SHAPE] is not None:
         _check_rectangle(row["scores"], row[schema.SCORES_SHAPE])
     elif name == schema.INPUT:
         _check_input(row)
-    return row
 
 
 def check_time(key: str, t_ns: int) -> None:
@@ -160,10 +141,10 @@ def _check_rectangle(scores: list[float], shape: list[float]) -> None:
 
 
 def _check_input(row: Mapping[str, Any]) -> None:
-    if row["kind"] not in (kind.value for kind in InputKind):
+    if row["kind"] is not None and row["kind"] not in (kind.value for kind in InputKind):
         raise ContentError(f"kind is {_quoted(row['kind'])}, not one of {', '.join(kind.value for kind in InputKind)}")
     try:
-        row["data"].encode("latin-1")
+        (row["data"] or "").encode("latin-1")
     except UnicodeEncodeError:
         raise ContentError(f"data is {_quoted(row['data'])}, not bytes as Latin-1 text") from None
 

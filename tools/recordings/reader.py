@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 
 from mcap.exceptions import EndOfFile, McapError
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Footer, McapRecord, Message, Schema
 from mcap.stream_reader import CRCValidationError, StreamReader
 
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
@@ -30,8 +30,15 @@ from shearloop.tools.recordings.intact_records import (
     check_size,
     intact_index,
 )
-from shearloop.tools.recordings.message_content import ContentError, OtherKeysError, check_time, read_content
+from shearloop.tools.recordings.message_content import check_time, read_content
 from shearloop.tools.recordings.monotonic_times import Messages, has_one_offset, in_monotonic_order
+from shearloop.tools.recordings.recorded_columns import (
+    ContentError,
+    MissingKeyError,
+    SchemaError,
+    TopicColumns,
+    recorded_topic,
+)
 
 _OTHER_PROGRAM = "another program made or changed this recording: record or import it again"
 
@@ -74,6 +81,11 @@ class OpenRecording:
         # By the records' names.
         self.metadata = {record.name: dict(record.metadata) for record in self._reader.iter_metadata()}
         self.identity, self.table = _checked_identity(path, self.metadata.get(schema.METADATA))
+        # By topic, the schemas of its channels.
+        self._schemas: dict[str, list[Schema | None]] = {}
+        for channel in summary.channels.values():
+            self._schemas.setdefault(channel.topic, []).append(summary.schemas.get(channel.schema_id))
+        self._columns: dict[str, TopicColumns] = {}
         # By topic, whether its messages have no source.
         self._imported: dict[str, bool] = {}
 
@@ -96,18 +108,34 @@ class OpenRecording:
         messages = self._reader.iter_messages(topics, log_time_order=by_log_time)
         return ((channel, message) for _, channel, message in messages)
 
+    def columns(self, topic: str) -> TopicColumns:
+        """Return the columns of a topic by its schema in the file; raises ContentError and UnknownTopicError."""
+        if topic not in self._columns:
+            first, *others = self._schemas.get(topic, [None])
+            if others and any((one and one.data) != (first and first.data) for one in others):
+                raise SchemaError(f"{topic}: it has several schemas")
+            try:
+                self._columns[topic] = recorded_topic(schema.schema_name(topic), first)
+            except SchemaError as error:
+                raise SchemaError(f"{topic}: {error}") from error
+        return self._columns[topic]
+
     def content(self, channel: Channel, message: Message) -> dict[str, Any]:
         """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""
+        columns = self.columns(channel.topic)
         try:
-            content = read_content(channel.topic, message.data)
+            content = read_content(channel.topic, message.data, columns)
             check_time("its log time", message.log_time)
             check_time("its publish time", message.publish_time)
             imported = "source" not in content
             if imported != self._imported.setdefault(channel.topic, imported):
                 raise ContentError("it has other keys than the first one")
             if "timestamp" in content and not has_one_offset(self.identity):
-                content |= schema.unix_times(schema.schema_name(channel.topic), content, message.log_time)
-                check_time(schema.ARRIVAL, content.get(schema.ARRIVAL) or 0)
+                known = columns.known(content)
+                times = schema.unix_times(schema.schema_name(channel.topic), known, message.log_time)
+                content |= {key: time for key, time in times.items() if known[key] is not None}
+                if known.get(schema.ARRIVAL) is not None:
+                    check_time(schema.ARRIVAL, content[schema.ARRIVAL])
         except ContentError as error:
             raise type(error)(f"{channel.topic}, number {message.sequence}: {error}") from error
         return content
@@ -147,18 +175,23 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
     with reading(path), open_file(path) as file:
         check_magic(path, file)
         recording = OpenRecording(path, file)
-        other = f"version {recording.identity.get('software', 'unknown')} wrote this recording: read it with that "
-        other += "version, or export other topics"
+        wrote = f"version {recording.identity.get('software', 'unknown')} wrote this recording"
         try:
             yield recording
         except schema.UnknownTopicError as error:
+            cure = "read it with that version, or export other topics"
             raise UserError(
-                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; {other}"
+                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; {wrote}: {cure}"
             ) from error
+        except MissingKeyError as error:
+            cure = "it can be exported as csv, parquet or mat"
+            raise UserError(
+                f"{path}: {error}, which the recording does not have; {wrote} without it; {cure}"
+            ) from error
+        except SchemaError as error:
+            raise UserError(f"{path}: a schema cannot be used: {error}; {_OTHER_PROGRAM}") from error
         except ContentError as error:
-            ours = recording.identity.get("code_sha256") == schema.code_digest()
-            cure = other if isinstance(error, OtherKeysError) and not ours else _OTHER_PROGRAM
-            raise UserError(f"{path}: a message cannot be used: {error}; {cure}") from error
+            raise UserError(f"{path}: a message cannot be used: {error}; {_OTHER_PROGRAM}") from error
 
 
 @contextmanager
@@ -168,6 +201,12 @@ def refusing_content(path: Path, topic: str) -> Iterator[None]:
         yield
     except ContentError as error:
         raise UserError(f"{path}: a message cannot be used: {topic}: {error}; {_OTHER_PROGRAM}") from error
+
+
+def columns_of_topics(path: Path, topics: Iterable[str]) -> dict[str, TopicColumns]:
+    """Return the columns of topics by their schemas in a recording; raises UserError."""
+    with open_recording(path) as recording:
+        return {topic: recording.columns(topic) for topic in topics}
 
 
 def read_messages(

@@ -45,8 +45,8 @@ from shearloop.errors import UserError
 from shearloop.estimation import BeforeFrame, HeldTool, Session
 from shearloop.models import validated
 from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
-from shearloop.tools.recordings.message_content import ContentError
-from shearloop.tools.recordings.reader import open_recording, reading
+from shearloop.tools.recordings.reader import OpenRecording, open_recording, reading
+from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns
 from shearloop.tools.recordings.replayed_skin import ReplayedSkin
 
 # Topics that a replay computes. All others are sent as they were recorded.
@@ -55,6 +55,12 @@ COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
+# The keys that a replay needs of each raw input and of each message, and the further ones by topic.
+_INPUT_KEYS, _CLOCK_KEYS = ("t_mono_ns", "kind", "data"), ("t_mono_ns", "offset_ns")
+_MESSAGE_KEYS: Mapping[str, tuple[str, ...]] = {
+    messages.EitFrame.topic: ("age_s", "frame"),
+    messages.SkinShear.topic: ("sample",),
+}
 # A daemon's has some kilobytes. One of this size is refused key by key within two seconds.
 _LARGEST_CONFIGURATION_BYTES = 1 << 20
 
@@ -68,6 +74,8 @@ class RecordedEvent:
     content: Mapping[str, Any]
     source: str = ""
     raw: RawEvent | None = None
+    # The keys of the content that its recording has, with the types of this version.
+    recorded: Collection[str] = ()
 
 
 class ReplayEvents(NamedTuple):
@@ -125,9 +133,36 @@ class RecordedRun:
             self.metadata = recording.identity
             self._attached = recording.attachments()
             continued = recording.metadata.get(schema.CONTINUED_METADATA, {})
+            # By topic.
+            self._columns = {
+                topic: self._checked_columns(recording, topic) for topic, count in self.counts.items() if count
+            }
         # Of a recording that begins in the middle of a run: the sources that continue from a state.
         self.continued = frozenset(continued.get("sources", "").split())
         self._own: DaemonConfig | None = None
+
+    def _checked_columns(self, recording: OpenRecording, topic: str) -> TopicColumns:
+        """Return the columns of a topic; raises MissingKeyError if it lacks a key that the replay needs."""
+        columns, name = recording.columns(topic), schema.schema_name(topic)
+        if name == schema.INPUT:
+            needed: Collection[str] = _INPUT_KEYS
+        elif name == schema.CLOCK_TOPIC:
+            needed = _CLOCK_KEYS
+        else:
+            own = _MESSAGE_KEYS if self.has_inputs else schema.IMPORTED_KEYS
+            needed = (*sorted(messages.ENVELOPE), *own.get(name, ()))
+        columns.need(topic, needed, "a replay")
+        return columns
+
+    @property
+    def not_recorded(self) -> dict[str, list[str]]:
+        """By topic, the keys of this version that the recording does not have."""
+        return {topic: columns.not_recorded for topic, columns in self._columns.items() if columns.not_recorded}
+
+    @property
+    def left_out(self) -> dict[str, list[str]]:
+        """By topic, the recorded keys that this version does not have, which a replay does not send."""
+        return {topic: columns.unknown for topic, columns in self._columns.items() if columns.unknown}
 
     @property
     def has_inputs(self) -> bool:
@@ -170,11 +205,12 @@ class RecordedRun:
             # An imported recording has one side after the other, a live one is in order.
             recorded = recording.messages(by_time=not self.has_inputs)
             for number, (channel, message) in enumerate(recorded):
-                content = recording.content(channel, message)
+                columns = self._columns[channel.topic]
+                content = columns.known(recording.content(channel, message))
                 if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
                     yield _imported_event(channel.topic, content, message.log_time, number)
                 else:
-                    yield _live_event(channel.topic, content)
+                    yield _live_event(channel.topic, content, columns.usable)
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
@@ -257,7 +293,8 @@ class ReplayComparison:
             self._add_difference(event, "the replay did not compute it")
             return
         computed = waiting.popleft()
-        keys = [key for key in event.content if key not in NOT_COMPARED and computed.get(key) != event.content[key]]
+        compared = (key for key in event.content if key in event.recorded and key not in NOT_COMPARED)
+        keys = [key for key in compared if computed.get(key) != event.content[key]]
         if keys:
             changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
             self._add_difference(event, ", ".join(changes))
@@ -460,14 +497,14 @@ class Replay:
             self._publisher.publish(heatmap)
 
 
-def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:
+def _live_event(topic: str, content: dict[str, Any], recorded: Collection[str]) -> RecordedEvent:
     if topic == schema.CLOCK_TOPIC:
         return RecordedEvent(topic, content["t_mono_ns"], content)
     live = schema.schema_name(topic)
     if live == schema.INPUT:
         raw = schema.input_event(content)
         return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
-    return RecordedEvent(live, content["t_mono_ns"], content, content["source"])
+    return RecordedEvent(live, content["t_mono_ns"], content, content["source"], recorded=recorded)
 
 
 def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.fingertip import Fingertip
-from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage, units
+from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
 from shearloop.errors import require
 from shearloop.files import replace_file
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.reader import read_messages
+from shearloop.tools.recordings.reader import columns_of_topics, read_messages
+from shearloop.tools.recordings.recorded_columns import TopicColumns
 
 TIMELINE = "time"
 # Values of an entity that are sent at once, and images.
@@ -65,11 +66,12 @@ class _Copy(threading.Thread):
 class _RerunFile:
     """Adds messages to a Rerun file, in batches."""
 
-    def __init__(self, out: IO[bytes], folder: Path, fingertip: Fingertip) -> None:
-        """Take the file, and an empty folder."""
+    def __init__(self, out: IO[bytes], folder: Path, fingertip: Fingertip, columns: Mapping[str, TopicColumns]) -> None:
+        """Take the file, an empty folder, and the columns of each topic."""
         import rerun
 
         self._rr = rerun
+        self._columns_of = columns
         self._height_cm = fingertip.height_cm
         self._width_cm = float(np.ptp([x for x, _ in fingertip.outline().contour]))
         # The SDK may be switched off by an environment variable, and would then write nothing.
@@ -96,16 +98,23 @@ class _RerunFile:
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
         """Add one message of a recorded topic."""
         entity, live = self._rr.new_entity_path(topic.split(".")).lstrip("/"), schema.schema_name(topic)
+        columns = self._columns_of[topic]
         for key, value in content.items():
             if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in _NOT_SHOWN:
                 continue
             if isinstance(value, bool | int | float | list):
-                self._units.setdefault(f"{entity}/{key}", units(live).get(key, ""))
+                self._units.setdefault(f"{entity}/{key}", columns.units.get(key, ""))
                 self._add(f"{entity}/{key}", value, t_ns)
+        self._draw(entity, live, columns.known(content), t_ns)
+
+    def _draw(self, entity: str, live: str, content: Mapping[str, Any], t_ns: int) -> None:
+        """Add the image or the pose of a message, if it has what is drawn."""
         if live == EitHeatmap.topic:
-            self._models[content["source"]] = content["model"]
-            shape = [int(side) for side in content[schema.SCORES_SHAPE]]
-            self._add_image(f"{entity}/scores", np.array(content["scores"], float).reshape(shape), t_ns)
+            self._models[content["source"]] = content["model"] or ""
+            scores, sides = content["scores"], content[schema.SCORES_SHAPE]
+            if scores is not None and sides is not None:
+                shape = [int(side) for side in sides]
+                self._add_image(f"{entity}/scores", np.array(scores, float).reshape(shape), t_ns)
         elif live == EitEstimate.topic and content["k"] is not None and content["sigma"] is not None:
             model = self._models.get(content["source"], "")
             profile = conductivity_profile(model, content["k"], content["sigma"], self._height_cm)
@@ -114,8 +123,10 @@ class _RerunFile:
                 column = np.array(profile)[::-1, None] / 2
                 width = round(len(column) * self._width_cm / self._height_cm)
                 self._add_image(f"{entity}/conductivity", np.repeat(column, width, axis=1), t_ns)
-        elif live == RobotStateMessage.topic and len(content["tcp_pose"]) == _POSE and None not in content["tcp_pose"]:
-            self._add_pose(f"{entity}/tool_centre", content["tcp_pose"], t_ns)
+        elif live == RobotStateMessage.topic:
+            pose: list[float] = content["tcp_pose"] or []
+            if len(pose) == _POSE and None not in pose:
+                self._add_pose(f"{entity}/tool_centre", pose, t_ns)
 
     def close(self) -> None:
         """Write what waits, and the layout of the viewer; raises OSError where the disk does not take it."""
@@ -196,10 +207,11 @@ def export_rerun(
     Raises OSError for a file that cannot be written, UserError without rerun-sdk and for an unreadable recording.
     """
     require("rerun", "rerun", "a file for Rerun")
+    columns = columns_of_topics(path, topics)
     with (
         replace_file(out) as written,
         tempfile.TemporaryDirectory() as folder,
-        closing(_RerunFile(written, Path(folder), fingertip)) as file,
+        closing(_RerunFile(written, Path(folder), fingertip, columns)) as file,
     ):
         for topic, content, message in read_messages(path, topics, progress):
             file.add(topic, content, message.log_time)

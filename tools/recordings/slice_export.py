@@ -25,8 +25,9 @@ from shearloop.files import replace_file
 from shearloop.tools.outputs import new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
-from shearloop.tools.recordings.message_content import ContentError, check_length
+from shearloop.tools.recordings.message_content import check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
+from shearloop.tools.recordings.recorded_columns import ContentError
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5
@@ -34,7 +35,13 @@ MIN_FRAMES = 3
 CLIPPED_V = 0.45
 # More than a minute of frames and torques at 1.85 and 10.9 Hz.
 MAX_FRAMES, MAX_TORQUES = 256, 4096
-_TOPICS = (EitFrame.topic, LoadTorque.topic, GripperStateMessage.topic, LoopState.topic)
+# The keys of each topic that slices need. The message gets no others.
+_NEEDED: Mapping[str, tuple[str, ...]] = {
+    EitFrame.topic: ("source", "t_mono_ns", "line", "repeated"),
+    LoadTorque.topic: ("source", "t_mono_ns", "torque_nm", "valid"),
+    GripperStateMessage.topic: ("source", "t_mono_ns", "diameter_mm"),
+    LoopState.topic: ("source", "t_mono_ns", "step_name", "phase", "hold", "slices", "torque_source"),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,14 +68,17 @@ def export_slices(
     Returns the files, and how many holds have no slice by the reason. Existing slices stay. Raises OSError for files
     that cannot be written, and UserError for a recording that cannot be read or has no such hold; then no file is new.
     """
+    # Only a control loop holds angles; imported recordings have none.
+    used = [topic for topic in topics if schema.schema_name(topic) in _NEEDED] if LoopState.topic in topics else []
     with open_recording(path) as recording:
         table = recording.table
+        for topic in used:
+            recording.columns(topic).need(topic, _NEEDED[schema.schema_name(topic)], "an export of slices")
     sweep, slices, missed = _Sweep(table), list[_Slice](), Counter[str]()
-    # Only a control loop holds angles; imported recordings have none.
-    used = [topic for topic in topics if schema.schema_name(topic) in _TOPICS] if LoopState.topic in topics else []
     for topic, content, _ in read_messages(path, used, progress):
+        name = schema.schema_name(topic)
         with refusing_content(path, topic):
-            found = sweep.add(schema.schema_name(topic), content)
+            found = sweep.add(name, {key: content[key] for key in _NEEDED[name] if key in content})
         if isinstance(found, _Slice):
             slices.append(found)
         elif found is not None:

@@ -1,19 +1,20 @@
 """The content of one recording in numbers, closed or not; damaged parts are counted and left out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
-from mcap.records import Attachment, Message, Metadata
+from mcap.records import Attachment, Message, Metadata, Schema
 
 from shearloop.daemon.clock import ClockReading, ClockStep
 from shearloop.daemon.recorder import schema
 from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import IntactRecords, Progress
-from shearloop.tools.recordings.message_content import ContentError, read_content
+from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.monotonic_times import MonotonicTimes
 from shearloop.tools.recordings.reader import reading
+from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, recorded_topic
 
 # Fewer messages, or a shorter time, say nothing of a rate.
 MIN_RATED_MESSAGES, MIN_RATED_S = 3, 1.0
@@ -25,6 +26,11 @@ class TopicSummary:
 
     messages: int = 0
     rate_hz: float | None = None
+    # The keys of this version that its schema lacks, and the keys that this version lacks.
+    not_recorded: list[str] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    # Why its messages cannot be read, or empty.
+    problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +81,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
     """Return the summary of a recording, closed or not; raises UserError for another file."""
     records = IntactRecords(path, progress)
     topics: dict[str, TopicSummary] = {}
+    columns: dict[str, TopicColumns | None] = {}
     spans: dict[str, tuple[int, int]] = {}
     named: dict[str, list[dict[str, str]]] = {}
     attachments = []
@@ -84,10 +91,11 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
             case Message():
                 channel = records.channels[record.channel_id]
                 name, t_ns = channel.topic, clock.time_ns(channel, record)
-                if name == schema.CLOCK_TOPIC and (reading_now := _clock_reading(record)) is not None:
+                if name not in topics:
+                    topics[name], columns[name] = _described(name, records.schemas.get(channel.schema_id))
+                topics[name].messages += 1
+                if name == schema.CLOCK_TOPIC and (reading_now := _clock_reading(record, columns[name])) is not None:
                     readings.append((t_ns, reading_now))
-                topic = topics.setdefault(name, TopicSummary())
-                topic.messages += 1
                 first_ns, last_ns = spans.get(name, (t_ns, t_ns))
                 spans[name] = min(first_ns, t_ns), max(last_ns, t_ns)
             case Metadata():
@@ -142,10 +150,24 @@ def named_unix_ns(path: Path) -> int | None:
     return round(began.timestamp()) * 10**9
 
 
-def _clock_reading(message: Message) -> ClockReading | None:
-    """Return the reading of an entry of `input.clock`, or None for one that another program changed."""
+def _described(topic: str, written: Schema | None) -> tuple[TopicSummary, TopicColumns | None]:
+    """Return the summary of a topic without a message yet, and its columns by its schema in the file."""
     try:
-        content = read_content(schema.CLOCK_TOPIC, message.data)
+        columns = recorded_topic(schema.schema_name(topic), written)
+    except schema.UnknownTopicError:
+        return TopicSummary(problem="this version does not have this topic"), None
+    except ContentError as error:
+        return TopicSummary(problem=str(error)), None
+    return TopicSummary(not_recorded=columns.not_recorded, unknown=columns.unknown), columns
+
+
+def _clock_reading(message: Message, columns: TopicColumns | None) -> ClockReading | None:
+    """Return the reading of an entry of `input.clock`, or None for one that another program changed."""
+    if columns is None:
+        return None
+    try:
+        content = columns.known(read_content(schema.CLOCK_TOPIC, message.data, columns))
     except ContentError:
         return None
-    return ClockReading(content["offset_ns"], content[schema.SUSPENDED] or 0)
+    offset_ns = content["offset_ns"]
+    return None if offset_ns is None else ClockReading(offset_ns, content[schema.SUSPENDED] or 0)

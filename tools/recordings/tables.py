@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from shearloop.errors import missing
 from shearloop.tools.recordings.intact_records import Progress
-from shearloop.tools.recordings.message_content import column_units
-from shearloop.tools.recordings.reader import open_recording, read_messages
+from shearloop.tools.recordings.reader import columns_of_topics, open_recording, read_messages
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -53,8 +52,8 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         return len(self.counts)
 
     def units(self, topic: str) -> Mapping[str, str]:
-        """Return the unit of each key of a topic that has one."""
-        return column_units(topic)
+        """Return the unit of each key of a topic that has one; raises UserError for a topic of another version."""
+        return columns_of_topics(self.path, [topic])[topic].units
 
     def frame(self, topic: str) -> "DataFrame":
         """Return a topic as a pandas frame by UTC time, a column per element of an array: `line_0`, `line_1`, …

@@ -14,7 +14,9 @@ from shearloop.daemon.recorder.schema import basic_identity
 from shearloop.daemon.recorder.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.tools.recordings import message_content, replay
-from shearloop.tools.recordings.message_content import ContentError, columns, read_content
+from shearloop.tools.recordings.message_content import read_content
+from shearloop.tools.recordings.recorded_columns import ContentError
+from shearloop.tools.recordings.recorded_columns import own_columns as columns
 from tests.sample_messages import sample
 from tests.tools.recordings.every_message import made
 from tests.tools.recordings.test_damage import recorded

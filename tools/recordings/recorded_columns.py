@@ -71,12 +71,12 @@ class TopicColumns:
         shared = self.own.keys() & self.recorded.keys()
         return frozenset(key for key in shared if _is_of_kind(self.recorded[key].kind, self.own[key].kind))
 
-    @property
+    @cached_property
     def not_recorded(self) -> list[str]:
         """The keys of this version without a recorded value of its type."""
         return [key for key in self.own if key not in self.usable]
 
-    @property
+    @cached_property
     def unknown(self) -> list[str]:
         """The recorded keys that this version does not have."""
         return [key for key in self.recorded if key not in self.own]

@@ -74,8 +74,8 @@ class RecordedEvent:
     content: Mapping[str, Any]
     source: str = ""
     raw: RawEvent | None = None
-    # The keys of the content that its recording has, with the types of this version.
-    recorded: Collection[str] = ()
+    # The keys of the content that its recording does not have.
+    not_recorded: Collection[str] = ()
 
 
 class ReplayEvents(NamedTuple):
@@ -210,7 +210,7 @@ class RecordedRun:
                 if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
                     yield _imported_event(channel.topic, content, message.log_time, number)
                 else:
-                    yield _live_event(channel.topic, content, columns.usable)
+                    yield _live_event(channel.topic, content, columns.not_recorded)
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
@@ -293,7 +293,7 @@ class ReplayComparison:
             self._add_difference(event, "the replay did not compute it")
             return
         computed = waiting.popleft()
-        compared = (key for key in event.content if key in event.recorded and key not in NOT_COMPARED)
+        compared = (key for key in event.content if key not in NOT_COMPARED and key not in event.not_recorded)
         keys = [key for key in compared if computed.get(key) != event.content[key]]
         if keys:
             changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
@@ -497,14 +497,14 @@ class Replay:
             self._publisher.publish(heatmap)
 
 
-def _live_event(topic: str, content: dict[str, Any], recorded: Collection[str]) -> RecordedEvent:
+def _live_event(topic: str, content: dict[str, Any], not_recorded: Collection[str]) -> RecordedEvent:
     if topic == schema.CLOCK_TOPIC:
         return RecordedEvent(topic, content["t_mono_ns"], content)
     live = schema.schema_name(topic)
     if live == schema.INPUT:
         raw = schema.input_event(content)
         return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
-    return RecordedEvent(live, content["t_mono_ns"], content, content["source"], recorded=recorded)
+    return RecordedEvent(live, content["t_mono_ns"], content, content["source"], not_recorded=not_recorded)
 
 
 def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:

@@ -337,7 +337,7 @@ def test_a_default_that_is_written_out_keeps_the_report(tmp_path):
     written = {"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}
     path = write_rig(tmp_path, **written)
     assert identity_of(load_daemon_config(path), VERSION, SERIAL) == plain
-    gripper = {"socket": {"host": "192.168.1.10"}}
+    gripper = {"model": "Hand-E", "socket": {"host": "192.168.1.10"}}
     bare = identity_of(load_daemon_config(write_rig(tmp_path, gripper=gripper)), VERSION, SERIAL)
     gripper["socket"]["port"] = 63352
     assert identity_of(load_daemon_config(write_rig(tmp_path, gripper=gripper)), VERSION, SERIAL) == bare

@@ -694,7 +694,7 @@ def test_what_a_rig_without_the_papers_boards_cannot_measure_is_noted_and_raises
     path = tmp_path / "rig.yaml"
     source, daq = {"serial": {"serial_number": "1"}}, {"adc": {"device": {"serial_number": "2"}}}
     skin = {"source": source, "daq": daq, "calibration": "skin.yaml"}
-    gripper = {"socket": {"host": "192.168.1.10"}}
+    gripper = {"model": "Hand-E", "socket": {"host": "192.168.1.10"}}
     path.write_text(yaml.safe_dump({"skin": skin, "robot": "ur.yaml", "gripper": gripper}))
     context = SimpleNamespace(config=load_daemon_config(path))
     of_boards, of_tool = boards.unmeasured(context.config), tool.measure(context)

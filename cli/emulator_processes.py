@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig, EventConfig
     from shearloop.daemon.run_record import TorqueSeries
 
-# An emulator prints a line once its ports are open, which takes about two seconds.
-READY_S, POLL_S = 20.0, 0.02
+# An emulator prints a line once its ports are open, which takes about two seconds, and longer on a busy computer.
+READY_S, POLL_S = 60.0, 0.02
 # A device carries out a command within this, on a busy computer.
 OBEYS_S = 10.0
 # A process needs some of it to remove its port's link, to close its sockets, or to end its workers.
@@ -97,7 +97,7 @@ class EmulatedDevices:
         self._stack = contextlib.ExitStack()
 
     def __enter__(self) -> Self:
-        """Start the devices."""
+        """Start the devices; raises UserError if one does not start: another program may play one at its address."""
         with contextlib.ExitStack() as stack:
             if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in self._emulators):
                 self.truth = stack.enter_context(run_folder()) / "truth.jsonl"
@@ -111,9 +111,8 @@ class EmulatedDevices:
                 devices.append((process, output))
                 self._waiting += [(event, process) for event in emulator.events]
             until_s = time.monotonic() + READY_S
-            for process, output in devices:
-                while time.monotonic() < until_s and process.poll() is None and not os.fstat(output.fileno()).st_size:
-                    time.sleep(POLL_S)
+            for emulator, (process, output) in zip(self._emulators, devices, strict=True):
+                _wait_until_ready(emulator.device, process, output, until_s)
             self._devices = devices
             self._stack = stack.pop_all()
         return self
@@ -178,6 +177,16 @@ class EmulatedDevices:
                 if process.stdin is not None and process.poll() is None:
                     process.stdin.write(f"{event.command}\n".encode())
                     self.sent.append((time.monotonic_ns(), event.command))
+
+
+def _wait_until_ready(device: str, process: "subprocess.Popen[bytes]", output: IO[bytes], until_s: float) -> None:
+    """Wait for the line that an emulator prints once its ports are open; raises UserError without one."""
+    while not os.fstat(output.fileno()).st_size:
+        if process.poll() is not None:
+            raise UserError(f"the emulated device `{device}` did not start; the line above says why. Nothing was begun")
+        if time.monotonic() > until_s:
+            raise UserError(f"the emulated device `{device}` did not start within {READY_S:g} s: run it again")
+        time.sleep(POLL_S)
 
 
 def _has_obeyed(printed: bytes, command: str) -> bool:

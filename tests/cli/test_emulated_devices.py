@@ -78,11 +78,19 @@ def test_a_rig_that_ended_or_closed_its_input_gets_no_event(played, tmp_path, th
         assert devices.sent == []
 
 
-def test_devices_are_awaited_until_they_are_ready_or_have_ended(played, tmp_path):
+def test_devices_are_awaited_until_they_are_ready_and_may_end_later(played, tmp_path):
     late = f"import time; time.sleep(0.5); open({str(tmp_path / 'late')!r}, 'w'); print('more', flush=True); input()"
-    devices = played((emulator(device="eit-kit"), emulator()), late, "raise SystemExit(3)", ready="")
-    with devices:
+    ended = "print('ready', flush=True); raise SystemExit(3)"
+    with played((emulator(device="eit-kit"), emulator()), late, ended, ready=""):
         assert (tmp_path / "late").exists()
+
+
+def test_a_device_that_does_not_start_begins_nothing(played, tmp_path):
+    """Its address may have another program's robot, which a daemon would take for its own."""
+    runs = f"import time; open({str(tmp_path / 'runs')!r}, 'w'); print('ready', flush=True); input()"
+    devices = played((emulator(device="eit-kit"), emulator()), runs, "raise SystemExit(3)", ready="")
+    with pytest.raises(UserError, match="the emulated device `rig` did not start"), devices:
+        pytest.fail("it began")
 
 
 def test_ctrl_c_reaches_no_device(played, tmp_path):

@@ -11,7 +11,7 @@ from shearloop.drivers.ur.ports import connected
 
 REMOTE_CURE: Final = (
     "switch it to remote control, top right on the teach pendant (enable that first under Settings → System → Remote "
-    "Control)"
+    "Control; a CB3 has no such mode)"
 )
 # The dashboard's answer to a request that it carries out (UR's page "Dashboard Server e-Series").
 _CARRIED_OUT: Final = {

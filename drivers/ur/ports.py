@@ -16,6 +16,9 @@ SERVICES: Final = {RTDE_PORT: "RTDE", SCRIPT_PORT: "Real-Time Client", DASHBOARD
 # From this version on an e-Series opens only the enabled interfaces.
 FIRST_WITH_SERVICES: Final = (5, 10)
 SERVICES_MENU: Final = "Settings → Security → Services"
+# The other menus, of both generations: a controller that does not answer has no version.
+NETWORK_MENU: Final = "Settings → System → Network at the teach pendant, on a CB3 Setup Robot → Network"
+FIELDBUS_MENU: Final = "Installation → Fieldbus, on a CB3 under Installation"
 # A peer that acknowledges nothing for this time is gone.
 _PEER_GONE_S = 3
 
@@ -61,7 +64,7 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
         raise RobotLostError(
             "unreachable",
             f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its "
-            f"network (Settings → System → Network at the teach pendant){_all_refused_hint(error)}.",
+            f"network ({NETWORK_MENU}){_all_refused_hint(error)}.",
         ) from error
 
 

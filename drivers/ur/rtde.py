@@ -10,7 +10,7 @@ from typing import Final
 
 from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.drivers.ur.messages import RobotLostError
-from shearloop.drivers.ur.ports import connected
+from shearloop.drivers.ur.ports import FIELDBUS_MENU, connected
 from shearloop.drivers.ur.script import FIRST_WITH_LOWER_ALONE, LOWER, NO_MOTION_TICKS, UPPER, ScriptRegisters
 
 # Each package begins with its size in bytes, and its kind.
@@ -72,7 +72,7 @@ def registers_in_use(host: str) -> RobotLostError:
     return RobotLostError(
         "registers-in-use",
         f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
-        "PROFINET, or a URCap: end the other program, disable the adapter under Installation → Fieldbus, or uninstall "
+        f"PROFINET, or a URCap: end the other program, disable the adapter ({FIELDBUS_MENU}), or uninstall "
         "the URCap. A program whose cable was pulled keeps its registers for some minutes.",
     )
 

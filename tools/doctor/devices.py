@@ -27,6 +27,7 @@ from shearloop.drivers.ur.control_box import ControllerInfo, check_generation, c
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
 from shearloop.drivers.ur.limits import slowed_sentence, tool_difference
 from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.ports import FIELDBUS_MENU
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -154,7 +155,7 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
         yield note("robot's registers", registers, means, "end the other program if it commands the robot")
     else:
         means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
-        cure = "close the other program, or disable the adapter under Installation → Fieldbus"
+        cure = f"close the other program, or disable the adapter ({FIELDBUS_MENU})"
         yield trouble("robot's registers", "in use", means, cure)
 
 

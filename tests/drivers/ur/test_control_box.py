@@ -12,10 +12,11 @@ import pytest
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.control_box import check_generation, check_ports, probe_controller, query_controller
-from shearloop.drivers.ur.dashboard import command_dashboard, serial_number_in
+from shearloop.drivers.ur.dashboard import REMOTE_CURE, command_dashboard, serial_number_in
 from shearloop.drivers.ur.fitness import why_unfit
 from shearloop.drivers.ur.messages import ROBOT_MODES, RUNTIME_STATES, SAFETY_MODES, RobotLostError, Unlock
-from shearloop.drivers.ur.ports import SERVICES, closed_ports_sentence, probe_ports
+from shearloop.drivers.ur.ports import SERVICES, closed_ports_sentence, explain_failure, probe_ports
+from shearloop.drivers.ur.rtde import registers_in_use
 from shearloop.drivers.ur.settings import TorqueBound, UrSettings
 from shearloop.emulators.ur_controller import Controller
 from shearloop.emulators.ur_robot import Robot
@@ -186,3 +187,20 @@ def test_the_tables_are_complete_and_the_page_has_the_same_words():
 )
 def test_only_the_emulated_controllers_own_answer_makes_it_an_emulated_one(answer, found):
     assert serial_number_in(answer) == found
+
+
+def test_a_menu_is_named_as_both_generations_have_it():
+    """A controller that does not answer says no version, and the menus of a CB3 differ."""
+    with pytest.raises(RobotLostError, match="on a CB3 Setup Robot → Network"), explain_failure("10.0.0.1", 1.0, "it"):
+        raise ConnectionRefusedError
+    assert "(Installation → Fieldbus, on a CB3 under Installation)" in str(registers_in_use("10.0.0.1"))
+    assert "a CB3 has no such mode" in REMOTE_CURE
+
+
+def test_no_sentence_names_a_menu_of_one_generation_alone():
+    """Each menu is a constant, whose name every sentence has."""
+    rooms = ("drivers", "tools", "daemon", "cli")
+    texts = {path: path.read_text(encoding="utf-8") for room in rooms for path in sorted(Path(room).rglob("*.py"))}
+    named = {path.as_posix() for path, text in texts.items() if re.search(r"(Settings|Installation) → ", text)}
+    # The URCap is for an e-Series from 5.17 on alone, as its sentence says.
+    assert named == {"drivers/ur/ports.py", "drivers/ur/dashboard.py", "drivers/robotiq/socket_client.py"}

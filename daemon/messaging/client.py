@@ -42,8 +42,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
 
     It receives one topic or several, or all: `topics` are names, such as `eit.estimate`, or their first part, such as
     `eit`. Raises UserError for an unknown topic, for a malformed address, for messages of another program, and if no
-    message arrives for `timeout_s`. Without `timeout_s` it waits, and calls `on_quiet` once if no message has come in
-    QUIET_S; by default that is a warning.
+    message arrives for `timeout_s`. Without `timeout_s` it waits, and calls `on_quiet` once with a sentence if no
+    message has come in QUIET_S; by default that is a warning.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         topics: str | Iterable[str] = (),
         timeout_s: float | None = None,
         keys: ClientKeys | None = None,
-        on_quiet: Callable[[], None] | None = None,
+        on_quiet: Callable[[str], None] | None = None,
     ) -> None:
         """Connect; an address on another computer needs keys."""
         self._topics = _names(topics)
@@ -61,7 +61,8 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
         if timeout_s is not None and _milliseconds(timeout_s) == 0:
             raise _no_such_time(timeout_s)
         self._address, self._timeout_s, self._keys = address, timeout_s, keys
-        self._on_quiet, self._has_waited = on_quiet or self._warn, timeout_s is not None
+        self._on_quiet = on_quiet or logging.getLogger(__name__).warning
+        self._has_waited = timeout_s is not None
         self._context = zmq.asyncio.Context()
         self._socket = self._context.socket(zmq.SUB)
         self._blocking: zmq.Socket[bytes] = zmq.Socket.shadow(self._socket.underlying)
@@ -93,29 +94,38 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
     def __next__(self) -> TopicContent:
         """Wait for the next message and return it."""
         if not self._has_waited:
-            self._note(came=self.wait(QUIET_S))
+            self._has_waited = True
+            if not self.wait(QUIET_S):
+                self._on_quiet(self._why_quiet(self._probed()))
         if not self.wait(self._timeout_s):
-            with _Probe(self._address, self._keys) as probe:
-                raise self._no_message(probe.found(came=bool(probe.blocking.poll(_milliseconds(PROBE_S)))))
+            raise self._no_message(self._probed())
         return self._decoded(self._blocking.recv_multipart())
 
     async def __anext__(self) -> TopicContent:
         """Wait for the next message and return it."""
         if not self._has_waited:
-            self._note(came=bool(await self._socket.poll(_milliseconds(QUIET_S))))
+            self._has_waited = True
+            if not await self._socket.poll(_milliseconds(QUIET_S)):
+                self._on_quiet(self._why_quiet(await self._probed_meanwhile()))
         if not await self._socket.poll(_milliseconds(self._timeout_s)):
-            with _Probe(self._address, self._keys) as probe:
-                raise self._no_message(probe.found(came=bool(await probe.events.poll(_milliseconds(PROBE_S)))))
+            raise self._no_message(await self._probed_meanwhile())
         return self._decoded(await self._socket.recv_multipart())
 
-    def _note(self, *, came: bool) -> None:
-        self._has_waited = True
-        if not came:
-            self._on_quiet()
+    def _probed(self) -> "_Found":
+        with _Probe(self._address, self._keys) as probe:
+            return probe.found(came=bool(probe.blocking.poll(_milliseconds(PROBE_S))))
 
-    def _warn(self) -> None:
-        waits = "no message came from %s in %g s; waiting. Is a daemon running there?"
-        logging.getLogger(__name__).warning(waits, self._address, QUIET_S)
+    async def _probed_meanwhile(self) -> "_Found":
+        with _Probe(self._address, self._keys) as probe:
+            return probe.found(came=bool(await probe.events.poll(_milliseconds(PROBE_S))))
+
+    def _why_quiet(self, found: "_Found") -> str:
+        nothing = f"no message came from {self._address} in {QUIET_S:g} s; waiting"
+        if found is _Found.PUBLISHER:
+            return f"{nothing}. A daemon is there; does it publish {' or '.join(self._topics) or 'anything'}?"
+        if self._keys is not None or is_open_to_network(self._address):
+            return f"{nothing}. Is a daemon running there? If one is, {_key_cause(self._keys)}"
+        return f"{nothing}. Is a daemon running there?"
 
     def _no_message(self, found: "_Found") -> UserError:
         nothing = f"no message came from {self._address} for {self._timeout_s:g} s"
@@ -126,10 +136,12 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
                 "it, and `shearloop listen` shows what it publishes"
             )
         if found is _Found.OTHER:
-            return UnreachedError(
-                f"{nothing}: the program there does not publish to this client; give the address of the daemon's "
-                f"`publish` key, not of its `commands`{_keys_hint(self._keys)}"
-            )
+            address = "the address of the daemon's `publish` key, not of its `commands`"
+            if self._keys is None:
+                hint = f"; give {address}{_keys_hint(self._keys)}"
+            else:
+                hint = f": {_key_cause(self._keys)}; or give {address}"
+            return UnreachedError(f"{nothing}: the program there does not publish to this client{hint}")
         if others := other_listeners(self._address):
             listens = f"a program of this computer listens at {others[0]}: if it is the daemon, give that address"
             return UnreachedError(f"{nothing}: {listens}{_keys_hint(self._keys)}")
@@ -233,7 +245,7 @@ def receive_messages(
     topics: Iterable[str],
     timeout_s: float | None = None,
     keys: ClientKeys | None = None,
-    on_quiet: Callable[[], None] = lambda: None,
+    on_quiet: Callable[[str], None] = lambda _: None,
 ) -> Iterator[TopicContent]:
     """Yield the messages of a Subscriber for a command; calls `on_quiet` if none arrives in the first QUIET_S."""
     try:
@@ -293,10 +305,7 @@ def _cure(address: str, keys: ClientKeys | None) -> str:
             return (
                 f"a daemon that is open to the network, as the program there is, answers only with keys: give {options}"
             )
-        return (
-            "a program listens there: if it is the daemon, your key is not allowed (`sudo shearloop keys allow FILE`), "
-            f"or your server.key is another daemon's ({options})"
-        )
+        return f"a program listens there: if it is the daemon, {_key_cause(keys)} ({options})"
     if others := other_listeners(address):
         return f"a program of this computer listens at {others[0]}: if it is the daemon, give --connect {others[0]}"
     return (
@@ -333,6 +342,13 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         raise UserError(
             f"{address!r} is not an address ({error.strerror}); it looks like tcp://127.0.0.1:7761"
         ) from error
+
+
+def _key_cause(keys: ClientKeys | None) -> str:
+    """Return why a daemon that is open to the network does not answer."""
+    if keys is None:
+        return "it answers only with keys"
+    return "your key is not allowed (`sudo shearloop keys allow FILE`), or your server.key is another daemon's"
 
 
 def _keys_hint(keys: ClientKeys | None) -> str:

@@ -104,7 +104,8 @@ def reachable(address: str) -> str:
     return address.replace("//0.0.0.0:", "//127.0.0.1:")
 
 
-async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, connect):
+async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, connect, monkeypatch):
+    monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)
     path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
     async with running_daemon(path) as daemon:
         commands = reachable(daemon.tasks["commands"].address)
@@ -126,9 +127,19 @@ async def test_only_allowed_clients_connect_and_only_encrypted(config, keys, con
             await asking.send(encode({"command": "status"}))
             assert not await asking.poll(SILENCE_MS), who
             assert not await hearing.poll(0), who
-            in_vain = pytest.raises(UserError, match="does not publish to this client")
+            told = "does not publish to this client" if stranger is None else "this client: your key is not allowed"
+            in_vain = pytest.raises(UserError, match=told)
             with Subscriber(published, keys=stranger, timeout_s=0.01) as subscriber, in_vain:
                 await anext(subscriber)
+            # Without a time it waits, and says why.
+            quiet: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+            with Subscriber(published, keys=stranger, on_quiet=quiet.set_result) as subscriber:
+                waiting = asyncio.ensure_future(anext(subscriber))
+                sentence = await quiet
+                waiting.cancel()
+                await asyncio.gather(waiting, return_exceptions=True)
+            cause = "it answers only with keys" if stranger is None else "your key is not allowed (`sudo shearloop keys"
+            assert f"waiting. Is a daemon running there? If one is, {cause}" in sentence, who
         assert daemon.health.tasks()["commands"]["errors"]["key is not allowed"] >= 1
         anyone = partial(asyncio.to_thread, send_to_stop_socket, commands)
         for name in ("start", "resume", "unlock", "tare", "pause"):

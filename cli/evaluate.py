@@ -151,15 +151,12 @@ def _checked_figure(args: argparse.Namespace) -> Path | None:
 
 def _status(tracks: "Sequence[EstimateTrack]") -> int:
     """Return the exit status; 1, with the reason, where no frame was judged."""
+    from shearloop.tools.evaluate import why_nothing_judged
     from shearloop.tools.figures import judged_frames
 
     if any(judged_frames(track).any() for track in tracks):
         return 0
-    print(
-        "Nothing was judged: no frame has both an estimate and a known torque or diameter. Give recordings with a load "
-        "cell, of the fingertip and the grip that were calibrated.",
-        file=sys.stderr,
-    )
+    print(f"Nothing was judged: {why_nothing_judged(tracks)}.", file=sys.stderr)
     return 1
 
 

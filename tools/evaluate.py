@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from shearloop.bank.bank_file import Bank
 from shearloop.estimation import Calibration, FrameSeries
 from shearloop.estimation.learned_frames import CANNOT_TELL_FRAMES, LearnedFrames
@@ -17,7 +19,7 @@ from shearloop.estimation.load_delay import load_delay_warning
 from shearloop.files import replace_file
 from shearloop.tools.estimate_tracks import ENDS, UNITS, EstimateTrack, estimate_in_worker
 from shearloop.tools.evaluation_figure import draw_stream
-from shearloop.tools.figures import judged_frames, no_better_than_clock
+from shearloop.tools.figures import Frames, judged_frames, no_better_than_clock
 from shearloop.tools.frame_series import check_no_copies, part_of
 from shearloop.tools.parallel import Executor
 from shearloop.words import counted
@@ -131,6 +133,23 @@ def invalid_reasons(tracks: Sequence[EstimateTrack]) -> list[InvalidReason]:
             kinds[_NUMBER.sub("#", sentence)][sentence] += 1
     found = [InvalidReason(counts.total(), counts.most_common(1)[0][0], len(counts) > 1) for counts in kinds.values()]
     return sorted(found, key=lambda reason: -reason.frames)
+
+
+def why_nothing_judged(tracks: Sequence[EstimateTrack]) -> str:
+    """Return why no frame has both an estimate and a known torque or diameter, with the cure."""
+    frames = {quantity: [Frames.of(track, quantity) for track in tracks] for quantity in UNITS}
+    estimated = [quantity for quantity, found in frames.items() if any(one.is_estimated.any() for one in found)]
+    known = [quantity for quantity, found in frames.items() if any(np.isfinite(one.truth).any() for one in found)]
+    if not estimated:
+        cure = "give recordings, or a part of one (`--time-range`), of the fingertip and the grip that were calibrated"
+        reasons = [reason.sentence for reason in invalid_reasons(tracks)]
+        reasons += [track.why_no_torque for track in tracks if track.why_no_torque]
+        return f"no frame has an estimate: {reasons[0] if reasons else 'there are no frames'}; {cure}"
+    if not known:
+        return "no frame has a known torque or diameter; give recordings with a load cell"
+    found = f"there are estimates of {' and '.join(estimated)}, and known values of {' and '.join(known)}"
+    cure = "give recordings with a load cell, of the grip that was calibrated"
+    return f"no frame has both an estimate and a known torque or diameter: {found}; {cure}"
 
 
 def _joined(reasons: Sequence[str]) -> str:

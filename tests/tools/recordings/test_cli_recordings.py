@@ -23,7 +23,7 @@ from shearloop.studies.slices.fitting import fit_slices
 from shearloop.studies.slices.series import SliceSeries
 from shearloop.tools.calibrate import CalibrationResult
 from shearloop.tools.estimate_tracks import EstimateTrack
-from shearloop.tools.evaluate import InvalidReason, invalid_reasons
+from shearloop.tools.evaluate import InvalidReason, invalid_reasons, why_nothing_judged
 from shearloop.tools.evaluation_figure import draw_stream, draw_tracks
 from shearloop.tools.figures import figures_of
 
@@ -207,7 +207,21 @@ def test_a_judgement_of_nothing_is_no_success(slices_folder, tmp_path, ran):
     calibration = tmp_path / "a.cal"
     ran("calibrate", slices_folder / "torque_slices", "--out", calibration)
     said = ran("evaluate", calibration, slices_folder / "diameter_slices", status=1).err
-    assert "Nothing was judged: no frame has both an estimate and a known torque or diameter." in said
+    assert "Nothing was judged: no frame has an estimate: outside the calibration: the Q residual is" in said
+
+
+def test_a_part_without_a_grip_is_the_cause_that_nothing_was_judged():
+    nothing, channels = np.full(3, np.nan), np.zeros((3, 1, 896))
+    series = FrameSeries(("right",), np.arange(3.0), channels, nothing[:0], nothing[:0], nothing)
+    idle = Estimate(valid=False, reasons=("nothing is gripped",))
+    said = why_nothing_judged([EstimateTrack(series, (idle, idle, idle), np.zeros(3))])
+    assert said.startswith("no frame has an estimate: nothing is gripped; give recordings, or a part")
+    felt = Estimate(valid=True, torque_nm=0.1, torque_low_nm=0.0, torque_high_nm=0.2)
+    said = why_nothing_judged([EstimateTrack(series, (felt, felt, idle), np.zeros(3))])
+    assert said == "no frame has a known torque or diameter; give recordings with a load cell"
+    known = replace(series, diameter_mm=np.full(3, 20.0))
+    said = why_nothing_judged([EstimateTrack(known, (felt, felt, idle), np.zeros(3))])
+    assert "there are estimates of torque, and known values of diameter; give recordings with a load" in said
 
 
 def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, ran):

@@ -48,7 +48,7 @@ SUPPLIED = Supplied(
     actuation_s=0.03,
     reaction_s=0.045,
     stop_rad=0.15,
-    widths=((10.0, 100.0), (60.0, 80.0), (110.0, 60.0), (160.0, 40.0), (210.0, 20.0)),
+    widths=((70.0, 100.0), (102.0, 80.0), (134.0, 60.0), (166.0, 40.0), (198.0, 20.0)),
 )
 
 
@@ -227,7 +227,7 @@ def test_a_report_supplies_rest_delay_stop_margin_and_widths(tmp_path):
     config = load_daemon_config(tmp_path / "rig.yaml")
     assert make_loop(config, settings, {}, {}, found.supplied).config.actuation_s == 0.03
     widths = measured_widths(found.supplied, "2F-140")
-    assert widths.width_mm(110.0) == pytest.approx(60.0, abs=0.1)
+    assert widths.width_mm(134.0) == pytest.approx(60.0, abs=0.1)
     assert measured_widths(NOTHING_SUPPLIED, "2F-140") is None
 
 

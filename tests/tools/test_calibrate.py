@@ -212,7 +212,8 @@ def test_a_gripper_on_a_robot_that_another_program_commands_is_not_calibrated(tm
     info = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=LOWER)
     monkeypatch.setattr(robot_use, "query_controller", lambda *_: info)
     monkeypatch.setattr(robot_use, "read_outputs", lambda *_: SimpleNamespace(runtime_state=2))
-    given = ("--host", "127.0.0.9", "--diameter-mm", "10", "--diameter-mm", "40", "--out", tmp_path / "gripper.yaml")
+    objects = ("--model", "2F-140", "--diameter-mm", "10", "--diameter-mm", "40")
+    given = ("--host", "127.0.0.9", *objects, "--out", tmp_path / "gripper.yaml")
     said = mistake("calibrate", "gripper", *given)
     assert "those from 24 on are in use" in said
     assert "A program is on the robot that was not started from here (playing)" in said

@@ -28,7 +28,7 @@ from shearloop.daemon.control.experiment_schema import (
     outline,
 )
 from shearloop.daemon.control.step_demands import demand
-from shearloop.daemon.torques import WRENCH, TorqueSource
+from shearloop.daemon.torques import LOAD_CELL, WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 from shearloop.estimation import Measured
@@ -48,6 +48,9 @@ def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
 def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[int, str]]:
     """Yield the number, from 0, of each step that twists a held tool the way that the driving source reads as 0."""
     other = direction_of(-driving.only_sign)
+    why = "its calibration has the other one alone; calibrate on twists both ways"
+    if driving.name == LOAD_CELL:
+        why = "its lever presses the other way alone, by `load_cell.direction`; turn that way"
     for number, step in enumerate(file.steps):
         turned: set[Direction | None] = set()
         match step:
@@ -60,8 +63,8 @@ def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[
         if other is not None and other in turned:
             yield (
                 number,
-                f"{step.do} turns {other}, and {driving.name} measures no torque of this direction: its calibration "
-                "has the other one alone; calibrate on twists both ways, or let another source drive",
+                f"{step.do} turns {other}, and {driving.name} measures no torque of this direction: {why}, or let "
+                "another source drive",
             )
 
 

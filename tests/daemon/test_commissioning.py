@@ -332,6 +332,17 @@ def test_an_experiment_of_another_source_is_refused_beyond_its_cap(tmp_path, cap
     assert "limits.torque_nm 0.35 N·m: write 0.3 or less" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("angle_rad", "status"), [(0.1, 0), (-0.1, 2)])
+def test_an_experiment_that_twists_away_from_a_one_way_lever_is_refused(tmp_path, capsys, angle_rad, status):
+    cell = {"device": {"serial_number": "7583"}, "direction": "counterclockwise"}
+    rig = write_rig(tmp_path, load_cell=cell)
+    steps = [{"do": "twist", "angles_rad": [angle_rad]}]
+    path = tmp_path / "one.yaml"
+    path.write_text(yaml.safe_dump({"name": "one", "torque_source": "load_cell", "steps": steps}))
+    assert main(["check", str(path), "--config", str(rig)]) == status
+    assert ("turns clockwise, and load_cell measures no torque" in capsys.readouterr().err) == (status == 2)
+
+
 def test_a_default_that_is_written_out_keeps_the_report(tmp_path):
     plain = identity_of(load_daemon_config(write_rig(tmp_path)), VERSION, SERIAL)
     written = {"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}

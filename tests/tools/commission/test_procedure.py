@@ -15,6 +15,7 @@ from shearloop.daemon.commissioned import commissioning_of
 from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.rig import open_settings
+from shearloop.tools.commission import stops
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.hand_stops import LAYERS, stops_of_layer
@@ -311,6 +312,17 @@ def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
     assert len(allowed) == 1
     assert "5 times" in allowed[0]
     assert "0.05, 0.2, 0.2, 0.2, 0.2 rad/s" in allowed[0]
+
+
+def test_the_raised_speed_is_one_from_which_a_person_stopped_the_wrist(lab, monkeypatch):
+    """Each press met a wrist that was slow, near the end of its way."""
+    monkeypatch.setattr(stops, "stops_by_hand", lambda *_: ([], 0.01, 0.12))
+    report, _ = lab.run("4", replace(COUNTS, stops=5, speeds_rad_per_s=(0.2,)))
+    assert failed(report) == []
+    assert report.supplied().wrist_speed_rad_per_s == 0.12
+    (line,) = (line for line in report.stages[0].lines if line.what == "allowed speed")
+    assert "0.12 rad/s" in line.value
+    assert "`--stages 4` tries again up to 0.2 rad/s" in line.value
 
 
 def test_a_cable_whose_samples_come_late_shows_the_whole_stop(lab):

@@ -120,3 +120,11 @@ def test_devices_that_end_with_the_rehearsal_have_no_past(lab):
     with left.during("2 gripper") as asked:
         assert asked is operator
     assert read_memory(memory_path(HOST)) == LEFT
+
+
+def test_a_state_without_a_grip_is_said_to_have_none():
+    """Zeros are kept wherever the fingers were not known to be empty, also where nothing was gripped."""
+    only_zeros = Remembered(wrench_zero=(0.0,) * 6)
+    assert "no grip is known" in left_tool(only_zeros)
+    assert left_tool(GRIP).startswith("a tool may be held, gripped with at most 60 N")
+    assert left_tool(Remembered()) == ""

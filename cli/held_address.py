@@ -18,7 +18,7 @@ def held_from_daemons(commands: str, holder: str) -> Iterator[None]:
 
     `holder` is the sentence for who asks there meanwhile. Raises UserError if a daemon, or another holder, has it.
     """
-    refuse_second_daemon(commands)
+    refuse_second_daemon(commands, cure="")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held:
         try:
             held.bind(stop_name(commands))

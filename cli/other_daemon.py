@@ -15,7 +15,7 @@ OTHER_ADDRESSES: Final = "give `publish` and `commands` other addresses in your 
 def refuse_second_daemon(commands: str, page: str = "", cure: str = OTHER_ADDRESSES) -> None:
     """Raise UserError if a daemon answers at this address of `commands`, with its process, its folder and its page.
 
-    `cure` says how to run beside it.
+    `cure` says how to run beside it; empty where nothing may.
     """
     reply = None
     with suppress(TimeoutError):
@@ -29,5 +29,5 @@ def refuse_second_daemon(commands: str, page: str = "", cure: str = OTHER_ADDRES
     raise UserError(
         f"a daemon runs already at {commands}: {whose_daemon(reply)}{shown}; "
         f"`shearloop command stop --connect {commands}` stops its experiment, and a "
-        f"second time ends it. To run beside it, {cure}"
+        f"second time ends it{f'. To run beside it, {cure}' if cure else ''}"
     )

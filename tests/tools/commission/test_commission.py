@@ -224,7 +224,9 @@ def test_a_robot_of_another_users_daemon_is_not_commissioned(tmp_path, mistake, 
         assert "is taken" in mistake("commission", path, "--out", tmp_path / "report.yaml")
     reply = {"ok": True, "daemon": {"process": 4711, "rig": "lab", "folder": "/opt/lab"}}
     monkeypatch.setattr(other_daemon, "send_to_stop_socket", lambda *_: reply)
-    assert "process 4711 (lab) in /opt/lab" in mistake("commission", path, "--out", tmp_path / "report.yaml")
+    said = mistake("commission", path, "--out", tmp_path / "report.yaml")
+    assert "process 4711 (lab) in /opt/lab" in said
+    assert "other addresses" not in said, "nothing may run beside it"
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -28,7 +28,11 @@ from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.script import LOWER
 from shearloop.emulators.boards import Hx711Board
 from shearloop.tools import robot_use
+from tests.emulator_process import own_address
 from tests.running import running
+
+# Without a robot's controller, which another program on this computer may play at 127.0.0.1.
+HOST = own_address(1)
 
 SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
@@ -152,9 +156,9 @@ async def test_the_load_cells_calibration_gives_up_with_what_came(tmp_path, monk
 @pytest.mark.parametrize("way", ["socket", "modbus"])
 def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
     out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
-    arguments = ("--port", "0") if way == "socket" else ("--link", str(link))
+    arguments = ("--port", "0", "--bind", HOST) if way == "socket" else ("--link", str(link))
     with Process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
-        where = gripper.hear("127.0.0.1:" if way == "socket" else str(link))
+        where = gripper.hear(f"{HOST}:" if way == "socket" else str(link))
         host, _, port = where.partition(":")
         reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
         diameters = ("--model", "2F-140", "--diameter-mm", "10", "--diameter-mm", "40")
@@ -185,13 +189,13 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
 
 
 def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it_opens(tmp_path):
-    write_memory(memory_path("127.0.0.1"), Remembered(force_n=60.0, running="loosen"))
-    with Process("emulate", "gripper-socket", "--port", "0") as gripper:
-        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+    write_memory(memory_path(HOST), Remembered(force_n=60.0, running="loosen"))
+    with Process("emulate", "gripper-socket", "--port", "0", "--bind", HOST) as gripper:
+        host, _, port = gripper.hear(f"{HOST}:").partition(":")
         reach = ("--host", host, "--socket-port", port, "--model", "2F-140")
         given = (*reach, "--diameter-mm", "10", "--diameter-mm", "40")
         calibration = ("calibrate", "gripper", *given, "--out", str(tmp_path / "gripper.yaml"))
-        with lock_gripper("localhost", int(port)), Process(*calibration) as calibrate:
+        with lock_gripper(f"::ffff:{HOST}", int(port)), Process(*calibration) as calibrate:
             status, _, refused = calibrate.end()
         assert status != 0
         assert f"the gripper at {host}:{port} is driven by another program of this computer" in refused
@@ -204,7 +208,7 @@ def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it
             calibrate.tell("")
             calibrate.hear("The fingers will open")
             calibrate.end()
-    assert read_memory(memory_path("127.0.0.1")).running == "loosen", "the arm waits for its own acknowledgement"
+    assert read_memory(memory_path(HOST)).running == "loosen", "the arm waits for its own acknowledgement"
 
 
 def test_a_gripper_on_a_robot_that_another_program_commands_is_not_calibrated(tmp_path, mistake, monkeypatch):
@@ -257,8 +261,8 @@ async def halted_mm(host: str, port: int, interrupt: Callable[[], None]) -> tupl
 @pytest.mark.parametrize("program", ["calibrate", "commission"])
 def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number, tmp_path):
     """They would go on by themselves, onto a hand that reaches for what stopped."""
-    with Process("emulate", "gripper-socket", "--port", "0", "--speed", "3") as emulated:
-        host, _, port = emulated.hear("127.0.0.1:").partition(":")
+    with Process("emulate", "gripper-socket", "--port", "0", "--bind", HOST, "--speed", "3") as emulated:
+        host, _, port = emulated.hear(f"{HOST}:").partition(":")
         diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
         given = ("--model", "2F-140", *diameters, "--out", str(tmp_path / "gripper.yaml"))
         command = [*SHEARLOOP, "calibrate", "gripper", "--host", host, "--socket-port", port, *given]
@@ -282,8 +286,8 @@ def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number
 def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(tmp_path):
     diameters, out = (8, 25, 45, 75), tmp_path / "gripper.yaml"
     emulated = ("--model", "2F-85", "--open-counts", "13", "--bow-mm", "2.5", "--port", "0", "--speed", "20")
-    with Process("emulate", "gripper-socket", *emulated) as gripper:
-        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+    with Process("emulate", "gripper-socket", "--bind", HOST, *emulated) as gripper:
+        host, _, port = gripper.hear(f"{HOST}:").partition(":")
         given = [word for diameter in diameters for word in ("--diameter-mm", str(diameter))]
         reach = ("--host", host, "--socket-port", port, "--model", "2F-85")
         with Process("calibrate", "gripper", *reach, *given, "--out", str(out)) as calibrate:
@@ -346,8 +350,8 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path):
 
 
 def test_a_gripper_socket_fails_on_request():
-    with Process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:
-        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+    with Process("emulate", "gripper-socket", "--port", "0", "--bind", HOST, "--speed", "10") as gripper:
+        host, _, port = gripper.hear(f"{HOST}:").partition(":")
         with socket.create_connection((host, int(port)), timeout=10) as client:
             client.sendall(b"GET FLT\n")
             assert client.recv(64) == b"FLT 00\n"
@@ -358,7 +362,7 @@ def test_a_gripper_socket_fails_on_request():
             with contextlib.suppress(ConnectionResetError):
                 while client.recv(64):
                     pass
-        assert gripper.hear("127.0.0.1:") == f"{host}:{port}"
+        assert gripper.hear(f"{HOST}:") == f"{host}:{port}"
         with socket.create_connection((host, int(port)), timeout=10) as client:
             client.sendall(b"GET FLT\n")
             assert client.recv(64) == b"FLT 14\n"

@@ -291,7 +291,7 @@ ON_SERIAL_PORTS = {
     "source": {"serial": {"serial_number": "0042"}},
     "daq": {"adc": {"device": {"serial_number": "0043"}}},
 }
-GRIPPER = {"socket": {"host": "192.168.1.10"}}
+GRIPPER = {"model": "2F-140", "socket": {"host": "192.168.1.10"}}
 
 
 @pytest.mark.real_time

@@ -42,7 +42,7 @@ _MEANINGS = {
     "coverage_95": "fraction of the known values within their 95 % intervals",
     "interval_nm": "median width of these intervals, N·m",
     "winkler_nm": "mean width plus 40 times the distance of a known value outside; less is better",
-    "valid_fraction": "fraction of the frames with an estimate",
+    "valid_fraction": "fraction of the frames with a known torque that have an estimated one",
     "gain": "mean estimate along the known torque over the mean of its size",
     "r": "correlation of estimated and known torque",
     "latency_ms_p50": "time of an estimate, ms, median",

@@ -64,20 +64,20 @@ def judged_frames(track: EstimateTrack) -> BoolArray:
 def figures_of(tracks: EstimateTrack | Sequence[EstimateTrack]) -> Figures:
     """Return the figures of all frames, by the names that `shearloop evaluate` prints.
 
-    Only valid frames with a known truth are judged; with fewer than two of them, errors are None. interval_nm is the
-    median width of the intervals. winkler_nm is their mean score. baseline_zero_rmse_nm is the error of an estimate
-    that is always 0. Known diameters add diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm. Without a
-    torque, coverage_95 is the diameter's.
+    Only valid frames with a known truth are judged; with fewer than two of them, errors are None. valid_fraction is
+    the fraction of the frames with a known torque that have an estimated one; without a known torque, it is the
+    diameter's. interval_nm is the median width of the intervals. winkler_nm is their mean score. baseline_zero_rmse_nm
+    is the error of an estimate that is always 0. Known diameters add diameter_rmse_mm, diameter_coverage_95 and
+    diameter_interval_mm. Without an estimated torque, coverage_95 is the diameter's.
     """
     tracks = _several(tracks)
     torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in UNITS.items())
-    valid = [estimate.valid for track in tracks for estimate in track.estimates]
     latency = np.concatenate([track.latency_ms for track in tracks])
     figures = {name: value for name, value in torque.items() if name not in ("n", "gain")} | {
-        "valid_fraction": float(np.mean(valid)) if valid else None,
+        "valid_fraction": (torque if torque["n"] else diameter)["valid_fraction"],
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
-        "frames": len(valid),
+        "frames": sum(len(track.estimates) for track in tracks),
     }
     if not torque["valid_fraction"]:
         figures["coverage_95"] = diameter["coverage_95"]
@@ -119,7 +119,10 @@ def no_better_than_clock(tracks: Sequence[EstimateTrack], loaded_nm: float = LOA
         return ""
     sides = tracks[0].series.sides
     if len(sides) == 1:
-        return f"This fingertip ({sides[0]}) does not beat the stopwatch: use both."
+        return (
+            f"This fingertip ({sides[0]}) alone does not beat the stopwatch: record and use both, grip harder, or "
+            "record twists that differ."
+        )
     return "The sensor does not beat the stopwatch: grip harder, or record twists that differ."
 
 

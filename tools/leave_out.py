@@ -226,11 +226,11 @@ def advice_on(
         return few_tools
     if kind == "tools" and not adapted:
         return "Another tool has a gain of its own: correct it with `shearloop adapt` on two twists of known torque."
-    if against := no_better_than_clock(judged):
-        return against
     if (n_grips := number_of_grips(recordings)) < _ENOUGH_GRIPS:
         grips = "One grip" if n_grips == 1 else "Two grips"
         return f"{grips} only: record three, because the gain changes from grip to grip."
+    if against := no_better_than_clock(judged):
+        return against
     return advice_of_coverage(judged, kind)
 
 

@@ -95,6 +95,17 @@ def test_figures_are_those_of_a_slow_loop(rows, loaded_nm):
         assert figures["winkler_nm"] == pytest.approx(sum(winkler_by_hand(*one) for one in ends) / n, abs=1e-12)
 
 
+def test_a_frame_that_is_valid_without_a_torque_has_no_estimate_of_it_anywhere():
+    track = track_of([(0.1, (0.1, 0.02, 0.02)), (0.1, (0.1, 0.02, 0.02)), (0.0, None), (0.0, None)])
+    without_torque = Estimate(True, (), diameter_mm=30.0, diameter_low_mm=29.0, diameter_high_mm=31.0)
+    track = replace(track, estimates=(*track.estimates[:2], without_torque, without_torque))
+    by_load = figures_by_load(track)
+    assert [by_load[name]["valid_fraction"] for name in ("loaded", "unloaded")] == [1.0, 0.0]
+    assert figures_of(track)["valid_fraction"] == 0.5
+    diameters = replace(track, series=replace(track.series, torque_nm=np.full(4, np.nan), diameter_mm=np.full(4, 30.0)))
+    assert figures_of(diameters)["valid_fraction"] == 0.5
+
+
 def test_a_table_that_cannot_be_written_whole_leaves_the_earlier_one(tmp_path):
     path, track = tmp_path / "e.csv", track_of([(0.1, (0.08, 0.01, 0.02))])
     path.write_text("earlier")

@@ -108,7 +108,7 @@ def test_the_stopwatch_knows_the_level_that_the_fit_does_not():
 @pytest.mark.parametrize(
     ("sides", "kind", "said"),
     [
-        (1, "raw", r"This fingertip \(right\) does not .*use both"),
+        (1, "raw", r"This fingertip \(right\) alone does not .*record and use both, grip harder"),
         (2, "raw", "grip harder"),
         (1, "slices", "random order"),
     ],
@@ -175,6 +175,17 @@ def test_tools_are_advised_to_adapt_and_counted_by_the_recordings():
     # A tool with nothing left to judge was recorded all the same.
     assert "record four" not in advice_on("tools", recordings, tracks[1:], adapted=True)
     assert "3 tools only: record four" in advice_on("tools", recordings[1:], tracks[1:], adapted=True)
+
+
+def test_too_few_grips_are_named_before_how_to_grip():
+    one, another, third = (twisting(seed=seed) for seed in (1, 2, 3))
+    for recordings, said in (
+        ([one], "One grip only: record three"),
+        ([one, another], "Two grips only: record three"),
+        ([one, another, third], "The sensor does not beat the stopwatch: grip harder"),
+    ):
+        tracks = [[off_by(each, 0.02)] for each in recordings]
+        assert said in advice_on("twists", recordings, tracks, adapted=False)
 
 
 def test_a_tool_without_a_torque_is_named():

@@ -51,12 +51,9 @@ def run(args: argparse.Namespace) -> int:
     plan = parts.plans[0].as_json() if parts.plans else None
     result = {"config": str(args.config), "parts": parts.texts, "open": for_real.splitlines(), "plan": plan}
     verdict = f"{args.config} is in order"
-    if for_real and args.rig is None:
-        if not args.json:
-            print(*sentences, f"{verdict} for a rehearsal (`shearloop run --emulate`)", sep="\n", flush=True)
-        raise UserError(for_real)
     if for_real:
-        verdict = f"{for_real}\n{verdict} for a rehearsal of {args.rig}; the real devices need the changes above"
+        rehearsal = "a rehearsal (`shearloop run --emulate`)" if args.rig is None else f"a rehearsal of {args.rig}"
+        verdict = f"{for_real}\n{verdict} for {rehearsal}; the real devices need the changes above"
     return print_result(result, [*sentences, verdict], as_json=args.json)
 
 

@@ -103,9 +103,10 @@ class Daemon:
             self.commands = Commands(
                 self.rig, self.sensors, self._experiment, self.health, self.ending, tare_refusal, report, running_rig
             )
-            server = CommandServer(context, config.commands, self.commands.handlers(), refusals, keys)
+            emulated, handlers = running_rig.emulated, self.commands.handlers()
+            server = CommandServer(context, config.commands, handlers, refusals, keys, emulated=emulated)
             opened.callback(server.close)
-            stop_socket = StopSocket(server.address, self.commands.keyless_handlers(), refusals)
+            stop_socket = StopSocket(server.address, self.commands.keyless_handlers(), refusals, emulated=emulated)
             opened.callback(stop_socket.close)
             self._close = opened.pop_all().close
         tasks: dict[str, Task | None] = {

@@ -87,15 +87,7 @@ class Commands:
         """Return the handler of every command."""
         asking = {STATUS: self._status, EXPERIMENTS: self._experiments}
         acting = {name: partial(self._reported, name, handler) for name, handler in self._acting().items()}
-        return {name: partial(self._marked_if_emulated, handler) for name, handler in (asking | acting).items()}
-
-    async def _marked_if_emulated(self, handler: Handler, request: Request) -> Reply:
-        """Carry out a command; the reply or refusal of an emulated rig says that it is one."""
-        mark = {"emulated": True} if self.running_rig.emulated else {}
-        try:
-            return {**await handler(request), **mark}
-        except CommandRefusedError as error:
-            raise CommandRefusedError(str(error), **{**error.facts, **mark}) from error
+        return {**asking, **acting}
 
     def _acting(self) -> Mapping[str, Handler]:
         return {

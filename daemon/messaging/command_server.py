@@ -77,8 +77,10 @@ class RateLimit:
 class RequestExecutor:
     """Checks requests and executes commands; the sockets around it receive and reply."""
 
-    def __init__(self, handlers: Mapping[str, Handler], refusals: Refusals) -> None:
+    def __init__(self, handlers: Mapping[str, Handler], refusals: Refusals, *, emulated: bool = False) -> None:
+        """Begin without requests; replies of an `emulated` rig say that it is one."""
         self._handlers = handlers
+        self._mark: Reply = {"emulated": True} if emulated else {}
         self._refusals = refusals
         self._limit = RateLimit()
         self._running = 0
@@ -131,11 +133,11 @@ class RequestExecutor:
         # Pages and scripts ask for the status every second. A question before a command carries nothing out.
         quiet = name in READ_ONLY or request.get("ask")
         (log.debug if quiet else log.info)("command executed", command=name)
-        return {"ok": True, **reply}
+        return {"ok": True, **reply, **self._mark}
 
     def _refuse(self, kind: str, reason: str, *, frequent: bool = False) -> Reply:
         self._refusals.add(kind, reason, frequent=frequent)
-        return {"ok": False, "reason": reason}
+        return {"ok": False, "reason": reason, **self._mark}
 
 
 async def _stay_alive(late: LateRequests) -> None:
@@ -155,9 +157,11 @@ class CommandServer:
         handlers: Mapping[str, Handler],
         refusals: Refusals,
         keys: "KeyPair | None" = None,
+        *,
+        emulated: bool = False,
     ) -> None:
         """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
-        self._requests = RequestExecutor(handlers, refusals)
+        self._requests = RequestExecutor(handlers, refusals, emulated=emulated)
         self._refusals = refusals
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 100)

@@ -23,10 +23,12 @@ LARGEST_DATAGRAM_BYTES = 1024
 class StopSocket:
     """Receives requests and sends the replies, one at a time."""
 
-    def __init__(self, address: str, handlers: Mapping[str, Handler], refusals: Refusals) -> None:
+    def __init__(
+        self, address: str, handlers: Mapping[str, Handler], refusals: Refusals, *, emulated: bool = False
+    ) -> None:
         """Bind the stop socket of the command address; raises UserError if another daemon has it."""
         self._address = address
-        self._requests = RequestExecutor(handlers, refusals)
+        self._requests = RequestExecutor(handlers, refusals, emulated=emulated)
         self._refusals = refusals
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
         try:

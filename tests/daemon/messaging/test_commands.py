@@ -52,9 +52,9 @@ def handlers() -> Mapping[str, Any]:
 class Unbound(RequestExecutor):
     """The deciding half of the server, without its socket."""
 
-    def __init__(self) -> None:
+    def __init__(self, executed: Mapping[str, Any] | None = None, *, emulated: bool = False) -> None:
         refusals = Refusals()
-        super().__init__(handlers(), refusals)
+        super().__init__(handlers() if executed is None else executed, refusals, emulated=emulated)
         self.refused = refusals.counts
 
     async def reply(self, payload: bytes, *, t_ns: int = 0) -> dict[str, Any]:
@@ -359,13 +359,13 @@ async def test_replies_and_refusals_of_an_emulated_rig_say_so(emulated):
     rig = RunningRig("bench", emulated)
     sensors = SimpleNamespace(tareable={})
     handlers = Commands(None, sensors, None, health, ending, lambda **_: None, running_rig=rig).handlers()
-    for name in (STATUS, STOP):
-        assert (await handlers[name]({})).get("emulated", False) is emulated
-    assert (await handlers[STATUS]({}))["daemon"]["emulated"] is emulated
-    for name in ("start", "tare", "release", EXPERIMENTS):
-        with pytest.raises(CommandRefusedError) as refused:
-            await handlers[name]({})
-        assert refused.value.facts.get("emulated", False) is emulated
+    server = Unbound(handlers, emulated=emulated)
+    replies = {name: await server.reply(encode({"command": name})) for name in (*handlers, "jump")}
+    assert {name for name, reply in replies.items() if reply["ok"]} == {STATUS, STOP}
+    malformed = await server.reply(b"\x92\x01\x02")
+    for reply in (*replies.values(), malformed):
+        assert reply.get("emulated", False) is emulated
+    assert replies[STATUS]["daemon"]["emulated"] is emulated
 
 
 async def test_tare_is_refused_during_an_experiment():

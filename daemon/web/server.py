@@ -254,9 +254,10 @@ class _Page:
             arguments["ask"] = True
         elif name in ASKED or (name in ASKED_IF_NEEDED and "digest" in arguments):
             arguments["confirmed"] = True
-        return await self._reply(name, self._bridge.command(name, clicked_ns, **arguments))
+        asks = "ask" in arguments
+        return await self._reply(name, self._bridge.command(name, clicked_ns, **arguments), asks=asks)
 
-    async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
+    async def _reply(self, name: str, requested: Awaitable[dict[str, Any]], *, asks: bool = False) -> web.Response:
         try:
             reply = await requested
         except LateRequestError as error:
@@ -266,7 +267,8 @@ class _Page:
             return web.json_response({"ok": False, "reason": str(error), "unconfirmed": True}, status=504)
         except UserError as error:
             return self._refuse(503, str(error))
-        structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
+        answered = "question answered" if asks else "command answered"
+        structlog.get_logger().info(answered, command=name, ok=reply.get("ok"), reason=reply.get("reason"))
         content = {key: reply[key] for key in _SHOWN_KEYS if key in reply}
         if "ended_by_itself" in reply or "stopped_before" in reply:
             content["moved"] = nothing_moved(reply)

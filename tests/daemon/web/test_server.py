@@ -172,6 +172,22 @@ async def test_a_confirmation_is_the_digest_of_a_question(tmp_path):
         )
 
 
+async def test_a_question_is_logged_as_a_question_and_not_as_a_command(tmp_path, log):
+    async def reply(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {}
+
+    async with served(tmp_path, start=reply, release=reply) as page:
+        for path, event in (
+            ("start", "question answered"),
+            ("start?digest=d", "command answered"),
+            ("release", "question answered"),
+            ("release?digest=d", "command answered"),
+        ):
+            said = len(log.said)
+            assert (await post(page, f"/commands/{path}", **BEARER))[0] == 200
+            assert [one for one in log.said[said:] if one.endswith("answered")] == [event], path
+
+
 async def test_a_click_is_carried_out_soon_or_never_whatever_stood_still(tmp_path, monkeypatch):
     begun_ns, slow_ns = 1_000_000_000, [0]
     now_ns = begun_ns

@@ -54,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
         comparison = asyncio.run(_replay(run, config, args))
     same_code = run.metadata.get("code_sha256") == code_digest()
     made_by = "" if same_code else run.metadata.get("software", "of an unknown version")
+    if not args.check:
+        print(f"{run.path}: replayed {counted(sum(run.counts.values()), 'recorded message')}.", file=sys.stderr)
     for line in (*_other_keys_text(run, made_by), *_comparison_text(comparison, made_by)):
         print(line, file=sys.stderr)
     if args.json:

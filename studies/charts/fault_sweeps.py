@@ -262,7 +262,8 @@ def misaligned(
 
     def level(name: EstimatorName, shift_s: float) -> FaultLevel:
         late = replace(split.past, torque_t_s=split.past.torque_t_s + shift_s)
-        calibrations = fitted(replace(split, past=late), [name], physics)
+        shifted = f"{split.title}, torques that this chart shifted by {shift_s:+g} s"
+        calibrations = fitted(replace(split, title=shifted, past=late), [name], physics)
         if not calibrations:
             return FaultLevel(shift_s)
         estimates = estimate_frames(reading_with(calibrations[0], physics.bank), judged)

@@ -349,7 +349,10 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
     for path in files:
         for name in find_streams(path):
             if name in streams:
-                raise UserError(f"{path} is a second stream of {name}; import one recording at a time")
+                raise UserError(
+                    f"{path} is a second stream of {name}, after {paths[name]}: import one recording at a time, and "
+                    "name its files instead of the folder, such as one of a fingertip and one of the load cell"
+                )
             streams[name] = read_stream(path, name, time_format)
             paths[name] = path
     for earlier, later in itertools.permutations(streams, 2):

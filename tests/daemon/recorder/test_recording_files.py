@@ -547,7 +547,7 @@ def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
     for sources, why in (
         ([tmp_path / "empty"], r"holds no \.mat files"),
         ([tmp_path / "other.mat"], r"other\.mat holds x, expected one of Right_Data"),
-        ([folder, folder / "device0.mat"], "second stream of right"),
+        ([folder, folder / "device0.mat"], "second stream of right, after .*name its files instead of the folder"),
         ([folder / "load.mat"], "no frames"),
     ):
         with pytest.raises(UserError, match=why):

@@ -86,6 +86,17 @@ def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(slices, b
     assert json.dumps([one.hops for one in found])
 
 
+def test_a_calibration_on_shifted_times_is_named_as_shifted_by_the_chart(slices, monkeypatch):
+    titles = []
+    monkeypatch.setattr(fault_sweeps, "fitted", lambda split, *_: titles.append(split.title) or [])
+    [curve] = fault_sweeps.misaligned(slices, ["motion_regression"], None, (-0.27, 0.54))
+    assert [title.removeprefix(slices.title) for title in titles] == [
+        ", torques that this chart shifted by -0.27 s",
+        ", torques that this chart shifted by +0.54 s",
+    ]
+    assert [level.valid for level in curve.levels] == [0.0, 0.0]
+
+
 def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
     slices, bank, coarse_mesh, tmp_path, capsys
 ):

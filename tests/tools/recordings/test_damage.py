@@ -192,7 +192,9 @@ def test_a_wrong_byte_that_all_readers_would_accept_is_found_by_its_checksum(whe
 
 def test_a_check_without_a_comparison_fails(config, imported, tmp_path, ran):
     arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
-    assert "Nothing was compared" in ran("recording", "replay", imported, *arguments).err
+    played, compared = ran("recording", "replay", imported, *arguments).err.splitlines()
+    assert re.fullmatch(rf"{imported}: replayed [1-9]\d* recorded messages\.", played)
+    assert "Nothing was compared" in compared
     assert main(["recording", "replay", str(imported), *arguments, "--check"]) == 1
 
 

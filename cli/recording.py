@@ -202,6 +202,8 @@ def _repair(args: argparse.Namespace) -> int:
     lost += [counted(result.damaged_attachments, "damaged attachment")] if result.damaged_attachments else []
     saved = counted(result.messages, "message is", "messages are")
     sentences = [f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."]
+    if not result.was_damaged and not result.being_written:
+        sentences.append(f"{path} was intact: it needs no repair, and the copy holds the same.")
     sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
     if result.being_written:
         sentences.append(f"{path} is being written: the copy ends with what was there now.")

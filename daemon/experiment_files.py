@@ -148,7 +148,7 @@ class ExperimentFiles:
         async with _in_time("the folders of experiments"):
             reason = await self._refresh(reading_refusal)
         if self._latest is None:
-            return Listing({}, f"{reason}, and no folder of experiments is read during that time; ask again afterwards")
+            return Listing({}, f"{reason}; the folders are read afterwards")
         return Listing(self._latest, "")
 
     async def _refresh(self, reading_refusal: Callable[[], str | None]) -> str | None:

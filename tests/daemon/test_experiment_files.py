@@ -328,7 +328,7 @@ async def test_no_file_is_read_for_a_question_or_the_list_while_something_moves(
     # Without one it says why, which is no refusal: a page asks by itself.
     without = await answers_of(idle)["experiments"]({})
     assert without["experiments"] == []
-    assert "'three' is running, and no folder of experiments is read during" in without["unread"]
+    assert without["unread"] == "the experiment 'three' is running; the folders are read afterwards"
 
 
 async def test_no_file_is_read_for_a_question_or_the_list_while_another_starts(folder, slow_drive):

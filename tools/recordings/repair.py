@@ -31,6 +31,8 @@ class RepairResult:
     lost: dict[str, int]
     # Whether a program was writing the source: the copy has what was there then.
     being_written: bool
+    # Whether a part of the source, or its index, was missing or damaged.
+    was_damaged: bool
 
 
 def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> RepairResult:
@@ -94,6 +96,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         records.damaged_attachments,
         records.lost,
         being_written,
+        records.is_damaged,
     )
 
 

@@ -126,6 +126,8 @@ function diameterFigure(link, estimate) {
   put(byId("diameter-note"), [spread, held == null ? "" : `gripper ${link.number(gripper, "diameter_mm", 1)}`].filter(Boolean).join(", "));
 }
 
+const UNMATCHED = "no conductivity, k and σ: this frame was not matched in time";
+
 export class FingertipPanel {
   constructor(source, geometry) {
     this.source = source;
@@ -154,7 +156,9 @@ export class FingertipPanel {
     put(this.part("sigma"), link.number(estimate, "sigma", 3));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
-    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "", link.idle());
+    // Only a fingertip with a bank has a heatmap, and only a frame that came late has no match in it.
+    const unmatched = said.valid && said.k == null && heatmap ? UNMATCHED : "";
+    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : unmatched, link.idle() || unmatched !== "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
     // An empty picture would push all below it off a phone's screen.
     this.part("map").closest("figure").hidden = !heatmap;
@@ -241,6 +245,9 @@ export function robotPanel(link) {
 // What the gripper holds while its state, `object`, gives no diameter.
 const WITHOUT_DIAMETER = { unknown: "not known", moving: "–" };
 
+// The gripper's code while it opens and closes after a start; it ends by itself.
+const ACTIVATING = 5;
+
 export function gripperPanel(link) {
   const message = link.get("gripper.state");
   const known = "gripper" in (link.get("health")?.content.tasks ?? {});
@@ -248,7 +255,7 @@ export function gripperPanel(link) {
   markAge(byId("gripper"), link, message);
   if (!message) return;
   const said = message.content;
-  warn(byId("gripper-fault"), said.fault ? `fault ${said.fault}: ${said.fault_text}` : "");
+  warn(byId("gripper-fault"), said.fault ? `fault ${said.fault}: ${said.fault_text}` : "", said.fault === ACTIVATING);
   put(byId("gripper-width"), link.number(message, "width_mm", 1));
   put(byId("gripper-object"), said.object);
   const spread = said.diameter_std_mm == null ? "" : ` ± ${number(said.diameter_std_mm, 1)}`;
@@ -262,7 +269,7 @@ export function headPanel(link) {
   const health = link.get("health")?.content;
   show(byId("emulated"), Boolean(health?.emulated));
   const cap = health?.cap ?? "";
-  put(byId("cap"), cap && `${cap[0].toUpperCase()}${cap.slice(1)}. A record, not a safety function.`);
+  put(byId("cap"), cap && `${cap[0].toUpperCase()}${cap.slice(1)}. It guards against mistakes and is no safety function.`);
   show(byId("cap"), cap !== "");
   const name = [health?.rig, health?.host && `on ${health.host}`].filter(Boolean).join(" ");
   put(byId("rig"), name);

@@ -148,12 +148,20 @@ def test_a_torn_recording_is_refused_and_repaired(recording, tmp_path, ran, mist
     mistake("evaluate", "x.cal", torn)
     assert f"shearloop recording repair {torn}" in mistake("recording", "export", torn)
     assert "It was not closed" in ran("recording", "info", torn).out
-    assert "torn.mcap: 8 messages are saved" in ran("recording", "repair", torn).out
+    said = ran("recording", "repair", torn).out
+    assert "torn.mcap: 8 messages are saved" in said
+    assert "was intact" not in said
     assert torn.exists(), "the original stays"
     found = read_recording(tmp_path / "torn.mcap")
     np.testing.assert_array_equal(found.sides["right"].lines, LINES)
     assert found.source == "a bench"
     assert "exists already" in mistake("recording", "repair", torn)
+
+
+def test_an_intact_recording_that_is_repaired_is_said_to_have_been_intact(recording, ran, result_of):
+    assert f"{recording} was intact: it needs no repair" in ran("recording", "repair", recording).out
+    recording.with_name(f"{recording.stem}.repaired.mcap").unlink()
+    assert result_of("recording", "repair", recording)["was_damaged"] is False
 
 
 def test_a_damaged_chunk_is_left_out_and_counted(tmp_path, ran, result_of, monkeypatch):

@@ -313,6 +313,23 @@ def test_what_is_normal_before_the_first_torque_is_no_warning(reason, waits, bro
     assert browsed.page.evaluate("document.getElementById('torque-reason').classList.contains('waiting')") == waits
 
 
+@pytest.mark.parametrize(("fault", "waits"), [(5, True), (7, False)])
+def test_a_gripper_that_activates_is_no_warning(fault, waits, browsed):
+    browsed.open()
+    browsed.daemon.say(gripper={"fault": fault, "fault_text": "The gripper says so."})
+    browsed.until("#gripper-fault", f"fault {fault}: The gripper says so.")
+    assert browsed.page.evaluate("document.getElementById('gripper-fault').classList.contains('waiting')") == waits
+
+
+def test_a_valid_torque_without_a_match_says_why_it_has_no_conductivity(browsed):
+    browsed.open()
+    browsed.daemon.say(estimate={"k": None, "sigma": None, "score": None, "runner_up": None})
+    invalid = "[data-source=right] .invalid"
+    browsed.until(invalid, "no conductivity, k and σ: this frame was not matched in time")
+    assert browsed.page.evaluate(f"document.querySelector('{invalid}').classList.contains('waiting')")
+    assert browsed.text("[data-source=right] .k") == "–"
+
+
 @pytest.mark.parametrize(
     ("source", "name", "torque", "other"),
     [

@@ -91,6 +91,8 @@ LONG = tuple(
         "benchmarks/test_soak.py", "daemon/control/test_no_command_beyond_limits.py",
         "daemon/control/test_runner_any_order.py", "drivers/ur/test_script_any_order.py",
         "tools/recordings/test_replay_rig.py", "tools/recordings/test_rig_with_set_clock.py",
+        # Every topic without each of its keys, through every way out.
+        "tools/recordings/test_other_versions.py",
         # A newcomer's first hour, with the commands of the README.
         "cli/newcomer", "tools/commission/test_walk.py",
         # Figures: of the papers, of estimators on real recordings, of independent solutions.

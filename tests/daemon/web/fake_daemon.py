@@ -134,7 +134,10 @@ async def serve(folder: Path) -> None:
         found = [{"path": path, "name": name} for path, name in EXPERIMENTS.items()]
         return {"experiments": found, "configured": next(iter(EXPERIMENTS))}
 
-    handlers = {**{name: handler(name) for name in COMMANDS}, "experiments": experiments}
+    async def status(_request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"tasks": {}}
+
+    handlers = {**{name: handler(name) for name in COMMANDS}, "experiments": experiments, "status": status}
     with zmq.asyncio.Context() as context:
         await CommandServer(context, f"ipc://{folder}/commands", handlers, Refusals()).run()
 

@@ -360,7 +360,7 @@ def test_a_phone_shows_the_chart_on_its_first_screen(stopped, browsed):
     health = {"tasks": {}, "cap": cap, "emulated": True}
     browsed.daemon.say(health=health, loop=stop if stopped else {}, stop=unsent if stopped else {})
     page = browsed.open(token=True)
-    browsed.until("#cap", "A record")
+    browsed.until("#cap", "no safety function")
     page.set_viewport_size({"width": 390, "height": 844})
     page.wait_for_function("() => document.querySelector('#torque').nextElementSibling?.id === 'controls'")
     page.wait_for_selector("#torque-chart canvas")

@@ -176,8 +176,10 @@ class SafetyMonitor:
         codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.
         known = {fault.code for fault in stop.faults}
-        # What a present fault of a device hides comes after it, and else it is over.
-        over, hidden = (set(), _SHOWN_AT_REST - codes) if codes & _OF_DEVICES else (_SHOWN_AT_REST, set())
+        # What a present fault of a device hides comes after it, as what it makes the robot refuse; else it is over.
+        of_device = bool(codes & _OF_DEVICES)
+        over = set() if of_device else _SHOWN_AT_REST
+        hidden = (_SHOWN_AT_REST - codes) | {FaultCode.COMMAND_REFUSED} if of_device else set()
         kept = [replace(one, is_over=one.code in over) for one in stop.faults if one.code not in codes]
         kept += [fault for fault in active if fault.code in known]
         order = list(dict.fromkeys(fault.code for fault in stop.faults))

@@ -215,6 +215,15 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(seq
         assert (gate.waiting is not None) == (strongest in STOPS)
 
 
+@pytest.mark.parametrize("refused", [[], [FaultCode.COMMAND_REFUSED]])
+def test_a_lost_robot_is_named_before_what_came_with_its_earlier_state(refused):
+    monitor = SafetyMonitor()
+    monitor.judge([trouble(code) for code in (FaultCode.ROBOT_UNCONTROLLED, *refused)], 0)
+    lost = monitor.judge([trouble(code) for code in (*refused, FaultCode.ROBOT_LOST)], 1)
+    assert lost.faults[0].code is FaultCode.ROBOT_LOST
+    assert {fault.code for fault in lost.faults[1:]} == {FaultCode.ROBOT_UNCONTROLLED, *refused}
+
+
 def test_two_faults_of_one_code_are_both_reported():
     both = [Fault(FaultCode.DEVICE_LOST, "the gripper"), Fault(FaultCode.DEVICE_LOST, "the load cell")]
     gate = SafetyMonitor()

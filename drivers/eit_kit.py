@@ -42,6 +42,8 @@ START = b"y"
 SILENT_FRAMES = 4
 # Frames that follow each other sooner, in periods, waited on their way together.
 TOGETHER = 0.5
+# No EIT-kit is faster. What is, plays a recording faster than it was made, and waits for a reader that is late.
+FASTEST_NS = 50_000_000
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
 
@@ -205,7 +207,8 @@ class FrameParser(Parser[Frame]):
         """
         after_ns, period_ns = sent_ns - self._sent_ns, self.clock.period_ns
         # The configured period may be another board's.
-        together = self.clock.learned and after_ns < TOGETHER * period_ns
+        is_timed = self.clock.learned and period_ns >= FASTEST_NS
+        together = is_timed and after_ns < TOGETHER * period_ns
         self._sent_ns = sent_ns
         self._earliest_ns = self._earliest_ns + period_ns if together else sent_ns - LATE_NS
         if sent_ns >= self._earliest_ns:

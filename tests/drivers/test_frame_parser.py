@@ -333,6 +333,15 @@ def test_of_frames_that_waited_at_their_sender_for_long_none_passes_for_a_new_on
     assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=0.01)
 
 
+def test_a_recording_that_is_played_fast_to_a_late_reader_loses_no_frame():
+    """Its sender waits, and then sends all that waited, one frame after the other."""
+    period_ns = round(PERIOD_NS / 100)
+    parser = settled(period_ns)
+    back_ns = 40 * period_ns + 2 * LATE_NS
+    frames = [frame for n in range(300) for frame in parser.feed(LINES[n % 4], back_ns + n * 1_000_000)]
+    assert (len(frames), dict(parser.errors)) == (300, {})
+
+
 def test_a_frame_that_is_too_soon_counts_as_refused_and_does_not_accuse_another_board():
     parser = settled()
     back_ns = 60 * PERIOD_NS

@@ -200,7 +200,8 @@ class UrRobot:
                 await self._run_worker()
             except RobotLostError as loss:
                 self.losses[loss.kind] += 1
-                self._not_starting = str(loss) if loss.kind == "script" else ""
+                if loss.kind == "script":
+                    self._not_starting = str(loss)
                 pause_s = self.monitor.failed(loss, time.monotonic_ns())
                 await asyncio.sleep(math.inf if loss.kind in LASTING else pause_s)
 
@@ -232,6 +233,8 @@ class UrRobot:
         """Handle a message of the worker."""
         match message:
             case messages.RobotState():
+                if not message.blocked:
+                    self._not_starting = ""
                 if message.recovering and self._not_starting:
                     message = replace(message, blocked=self._not_starting)
                 before, self.state = self.state, message

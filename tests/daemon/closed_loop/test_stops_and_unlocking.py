@@ -58,8 +58,11 @@ async def test_a_program_that_does_not_start_is_named_by_answer_and_state(rig_co
         assert reply["reason"].startswith("The controller took the control program and does not play it: look at the")
         for code in (FaultCode.ROBOT_LOST, FaultCode.ROBOT_STARTING):
             since = watcher.count("loop.state")
-            state = await watcher.until("loop.state", lambda state, code=code: code.text in state["faults"], since)
-            assert "does not play it" in state["cause"]
+            state = await watcher.until(
+                "loop.state",
+                lambda state, code=code: code.text in state["faults"] and "does not play it" in state["cause"],
+                since,
+            )
             assert "stopped at the pendant" in state["reasons"], "what stopped it before is known too"
         fault("normal")
         while not (reply := await command("unlock"))["ok"]:

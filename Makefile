@@ -76,7 +76,7 @@ test-computing: install-dev
 
 test-waiting: install-dev
 	$(PYTEST) -n 5 -m 'real_time and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
-	$(PYTEST) -n 4 -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 3 -m 'not real_time and not computes and $(LENGTH)' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 # What depends most on the versions of Python and of the libraries; nothing in real time.
 FAST := tests/test_package.py $(addprefix tests/bank/test_,bank_file.py forward.py matching.py models.py) \

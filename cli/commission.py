@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from shearloop.cli.emulator_processes import EmulatedDevices
     from shearloop.daemon.config import DaemonConfig
 
-# What a daemon is told that starts meanwhile, and who sends it a command.
+# The reply to a daemon that starts meanwhile, and to every command.
 _HOLDER = (
     "`shearloop commission` (process {}) has the robot of {}: wait for its end, end it with Ctrl-C in its terminal, or "
     "press the emergency stop"

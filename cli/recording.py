@@ -206,7 +206,7 @@ def _repair(args: argparse.Namespace) -> int:
         sentences.append(f"{path} was intact: it needs no repair, and the copy holds the same.")
     sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
     if result.being_written:
-        sentences.append(f"{path} is being written: the copy ends with what was there now.")
+        sentences.append(f"{path} is being written: the copy ends with the present content.")
     return print_result({**asdict(result), "path": str(result.path)}, sentences, as_json=args.json)
 
 

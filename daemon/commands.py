@@ -334,7 +334,7 @@ def check_arguments(name: str, request: Request) -> None:
 
 
 def _why_unbound(name: str, request: Request) -> str | None:
-    """Return which arguments are missing that say of when a request is, and for which daemon; None if none is.
+    """Return which arguments are missing that bind a request to a time and a daemon; None if none is missing.
 
     The clock of `until_ns` begins again with the computer, so the daemon's `instance` belongs to it.
     """

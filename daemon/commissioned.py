@@ -25,7 +25,7 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
     report = load_report(config.commissioned)
     reason = why_not(report, config, now or datetime.now(UTC))
     measured = {} if reason else report.supplied().torque_sources or {}
-    # After another calibration nobody knows sign and scale.
+    # After another calibration, sign and scale are not known.
     same = (name for name, own in sorted(measured.items()) if source_sha256(config, name) == own)
     old = "".join(stage.stage[0] for stage, _ in old_stages(report, config)) if reason else ""
     return Commissioning(

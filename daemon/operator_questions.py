@@ -1,6 +1,6 @@
 """The questions before a start, a release and an unlock: what moves, and what happens to a held tool.
 
-Nothing moves while somebody asks, so their modules are loaded then.
+Nothing moves while a question is open, so its modules are loaded then.
 """
 
 from pathlib import Path

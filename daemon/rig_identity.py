@@ -27,7 +27,7 @@ _DEVICE_KEYS: Final[Any] = {
     "load_cell": {"device", "rate_hz"},
     "gripper": {"model", "socket", "modbus"},
 }
-# What changes a torque of the fingertips, beside their calibrations. A calibration names its bank.
+# What changes a torque of the fingertips, apart from their calibrations. A calibration names its bank.
 _TORQUE_KEYS: Final[Any] = {
     "fingertips": {"__all__": {"estimator", "matching", "baseline_frames", "average_frames", "creep"}},
     "combined": {"estimator", "creep"},
@@ -90,7 +90,7 @@ def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:
 def source_sha256(config: DaemonConfig, source: str) -> str:
     """Return the hash of the settings and the calibration behind a source's torques, of a fingertip or of several.
 
-    The stages of a commissioning judge what is behind the load cell and the wrench; their hash is that of no file.
+    For the load cell and the wrench it is the hash of no file: their settings belong to the stages of a commissioning.
     Raises UserError where the calibration cannot be read.
     """
     real = config.real

@@ -138,7 +138,7 @@ class RigMemory:
     _starting: str = ""
     # The state in the file.
     _written: Remembered | None = None
-    # Whether a stop waits, and when it began; None for one of an earlier process that ended without a word.
+    # Whether a stop waits, and when it began; None for one of an earlier process that ended without writing its time.
     _stop_waits: bool = False
     _stopped_s: float | None = None
     # The load cell's zero in its calibration, and the restored zero.

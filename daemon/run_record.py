@@ -1,4 +1,4 @@
-"""What is known of one run of an experiment, for its summary."""
+"""The record of one run of an experiment, for its summary."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ class TorqueSeries:
 
 @dataclass(slots=True)
 class StepSummary:
-    """What is known of one step."""
+    """The record of one step."""
 
     number: int
     name: str
@@ -62,7 +62,7 @@ class StepSummary:
 
 @dataclass(slots=True)
 class Run:
-    """What is known of one run of an experiment."""
+    """The record of one run of an experiment."""
 
     # The first and the latest `loop.state` of the experiment.
     first: Mapping[str, Any]

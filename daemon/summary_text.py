@@ -16,7 +16,7 @@ BAND = 0.10
 # A smaller band is within the noise of every torque.
 SMALLEST_BAND_NM = 0.001
 # A spread below this fraction of the half interval is none: friction hides how the torque moved.
-LEAST_SPREAD = 0.2
+MIN_SPREAD = 0.2
 # A torque has recovered from a disturbance when it stays in the band for this time.
 STAYS_S = 1.0
 # The name of the emulated tool's torque, which no sensor measures.
@@ -140,7 +140,7 @@ def _spread(held: TorqueSeries, set_nm: float | None) -> str:
     if held.bounds_nm is not None:
         low_nm, high_nm = held.bounds_nm.mean(axis=0)
         parts.append(f"its interval is {low_nm:+.4f} to {high_nm:+.4f}")
-    if torque_nm.std() >= LEAST_SPREAD * half_nm:
+    if torque_nm.std() >= MIN_SPREAD * half_nm:
         parts.append(f"standard deviation {torque_nm.std():.4f}")
     if set_nm is not None and half_nm <= BAND * abs(set_nm):
         parts.append(f"within ± {BAND:.0%} for {np.mean(_in_band(torque_nm, set_nm)):.0%} of the time")

@@ -42,7 +42,7 @@ START = b"y"
 SILENT_FRAMES = 4
 # Frames that follow each other sooner, in periods, waited on their way together.
 TOGETHER = 0.5
-# No EIT-kit is faster. What is, plays a recording faster than it was made, and waits for a reader that is late.
+# No EIT-kit is faster. A faster sender plays a recording faster than it was made, and waits for a late reader.
 FASTEST_NS = 50_000_000
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
@@ -195,7 +195,7 @@ class FrameParser(Parser[Frame]):
                 sent_ns = self.clock.arrived(t_arrival_ns, self._rejected_since_frame, self._waited_since_ns, behind)
                 if self._has_known_time(sent_ns):
                     frames.append(self._frame(one, sent_ns, t_arrival_ns))
-                # A whole frame is of this board, whatever its time is.
+                # A whole frame is of this board, even if its time is not known.
                 self._rejected_since_frame = self._refused_in_a_row = 0
         return frames
 

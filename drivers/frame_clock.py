@@ -18,7 +18,7 @@ SPACING_FRAMES = 4
 LONGEST_GAP = 2.5
 # A period further from the usual spacing is a burst of late frames. So are spacings whose middle half differs by more.
 PLAUSIBLE = 0.05
-# So many frames in a row are late by the same time, in periods, after a short pause of the board. A busy computer
+# The number of frames in a row that are equally late, in periods, after a short pause of the board. A busy computer
 # delays each frame by another time. A wrong period makes frames later than the phase by less than the minimum.
 EQUALLY_LATE = 4
 SAME_LATENESS = 0.05
@@ -39,7 +39,7 @@ class FrameClock:
 
     A frame is late, or the board paused before it and has a new phase. A pause of more than `longest_gap` periods shows
     at once. One of more than LATE_NS shows by two frames that are later than that. A shorter one shows by EQUALLY_LATE
-    frames in a row. The phase of the last frames follows what is shorter still.
+    frames in a row. The phase of the last frames follows still shorter pauses.
     """
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:

@@ -44,7 +44,7 @@ from shearloop.estimation.values import GripState, Measured
 from shearloop.words import CountedReasons, counted
 
 # Why a frame that is gripped and undisturbed is not fitted.
-_NO_ONE_POSITION = f"{AMBIGUOUS[0]}: build a bank whose grid of k and sigma is that of this fingertip"
+_NO_ONE_POSITION = f"{AMBIGUOUS[0]}: build a bank with a grid of k and sigma for this fingertip"
 _NO_TRUE_TORQUE = "no torque was measured at the time of a frame"
 # With more variance left on a tool of another diameter, the tools have no torque in common.
 _TOOLS_MAY_LEAVE = 0.75
@@ -310,9 +310,9 @@ def _check_new(learned: LearnedFrames, recording: FrameSeries, frames: IntArray,
 def _replay(
     calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
 ) -> tuple[CalibrationRows | None, CountedReasons]:
-    """Return the frames that an estimate would be made of, processed as in a session, and why the others are none.
+    """Return the frames that give an estimate, processed as in a session, and why the others give none.
 
-    The frames are None without any.
+    The frames are None if no frame gives one.
     """
     estimator, rows, grip, against = calibration.estimator, [], 0, CountedReasons()
     for recording, series in enumerate(recordings):

@@ -9,7 +9,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 
-# Of 95 % intervals. So many standard deviations to either side of a Gaussian's mean hold 95 %.
+# Of 95 % intervals. This number of standard deviations to either side of a Gaussian's mean holds 95 %.
 LEVEL, TWO_SIDED_95 = 0.95, 1.96
 # Metadata of a dataclass's field: in the calibration's file its fields join the other fields of the dataclass.
 INLINE = {"inline": True}

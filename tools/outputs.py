@@ -48,7 +48,7 @@ def check_apart(option: str, out: Path, others: Iterable[tuple[str, Path]]) -> N
 def check_link(option: str, out: Path) -> None:
     """Raise UserError if `out`, which `option` names, is a link to nothing.
 
-    A link is written through to its target. Without a target, the file would appear where nobody looks for it.
+    A link is written through to its target. Without a target, the file would appear in an unexpected place.
     """
     try:
         out.stat()

@@ -1,4 +1,4 @@
-"""What other programs have of a robot, by the controller's own word: also those of other users and other computers."""
+"""Which other programs use a robot, as its controller reports: also those of other users and other computers."""
 
 import re
 from contextlib import closing, suppress

@@ -1,4 +1,4 @@
-"""Whose daemon runs at an address."""
+"""The daemon that runs at an address, and its owner."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -320,7 +320,7 @@ class Fault:
 
     @property
     def cause(self) -> str:
-        """The sentence without its full stop, and without the cure; first when it was, where it is told of the past."""
+        """The sentence without its full stop and without the cure; a fault of the past begins with its time."""
         when = ", ".join(filter(None, (self.when, "over by now" if self.is_over else "")))
         # A driver's detail may end with a full stop; the sentence has its own.
         sentence = self.rule.sentence.format(detail=self.detail.removesuffix(".")).removesuffix(".")

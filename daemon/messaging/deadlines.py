@@ -11,7 +11,7 @@ from typing import Final
 
 # They let nothing move: they are never too late.
 NEVER_LATE: Final = ("status", "stop", "pause")
-# Without its age and its daemon, any other command that acts is refused: something could move that nobody asks for now.
+# Any other command that acts is refused without its time and its daemon: an old request could move something.
 MAY_BE_UNBOUND: Final = (*NEVER_LATE, "tare")
 
 

@@ -36,7 +36,7 @@ NOT_STARTING = (
 )
 ANOTHERS_PROGRAM = (
     "The program that runs on the robot may be another daemon's: another client writes the robot's input registers. An "
-    "unlock would go round a stop that waits there. End the other daemon, or stop the program at the pendant, then "
+    "unlock would bypass a stop that waits there. End the other daemon, or stop the program at the pendant, then "
     "unlock again."
 )
 
@@ -159,7 +159,7 @@ class Recovery:
                 self._ask_dashboard(now_ns, "brake release")
 
     def _stop_program(self, sample: RtdeSample, now_ns: int) -> None:
-        """Stop any program but that of another client, whose own stop may wait for its operator."""
+        """Stop a program, unless another client has it: its own stop may wait for its operator."""
         if sample.program_running and self._others is None:
             self._others = self._arm.has_other_client()
         if not (sample.program_running and self._others):

@@ -1,4 +1,4 @@
-"""What is wrong with a file that cannot be read as YAML, and which file was probably meant."""
+"""Explains the syntax errors of YAML files, and proposes the file that was probably meant."""
 
 from difflib import get_close_matches
 from pathlib import Path
@@ -11,7 +11,7 @@ from shearloop.mistakes import keys_of
 from shearloop.yaml_loader import MAX_BYTES, parse_yaml
 
 _SUFFIXES = (".yaml", ".yml")
-# So many files with near names are looked into, to see which may be meant.
+# The number of files with near names that are read, to find which may be meant.
 _LOOKED_AT = 5
 # The library's words for frequent mistakes, and ours.
 _SYNTAX = (
@@ -29,7 +29,7 @@ _SYNTAX = (
 
 
 def syntax(error: yaml.MarkedYAMLError) -> str:
-    """Return what is wrong with a text that is not YAML."""
+    """Return the syntax error of a text in words."""
     problem = str(error.problem or error.context)
     return next((words for begin, words in _SYNTAX if problem.startswith(begin)), problem)
 

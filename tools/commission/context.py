@@ -103,7 +103,7 @@ class Context:
         Raises UserError where others write all registers. A program is asked about each time; it would be replaced.
         """
         if self._mover is not None:
-            # The observer hears the robot all the time. Our program counts on, and nobody else can write its clock.
+            # The observer reads the robot's state all the time. Only our program changes this clock.
             if self._another_plays():
                 self.operator.accept(_REPLACED)
             return

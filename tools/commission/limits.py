@@ -44,9 +44,7 @@ class TimeLimits:
 
 
 # The value of a line that a rehearsal does not measure.
-REHEARSED: Final = (
-    "rehearsed: not measured, because the deadlines of emulated devices are longer than those of real ones"
-)
+REHEARSED: Final = "rehearsed: not measured, because the deadlines of emulated devices are longer than real deadlines"
 REAL: Final = TimeLimits(
     least_rate=0.99,
     longest_gap_s=0.04,

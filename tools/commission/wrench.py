@@ -173,7 +173,7 @@ def hung_mass(context: Context) -> Line:
 def largest_mass_kg(
     settings: UrSettings, payload_kg: float, model: str = "", rated_kg: float | None = None
 ) -> tuple[float, str]:
-    """Return the largest mass that may hang on the tool beside its payload, and what limits it.
+    """Return the largest mass that may hang on the tool in addition to its payload, and its bound in words.
 
     An arm of an unknown model counts as the smallest one. The weight stays below the limit at which the arm stops.
     """

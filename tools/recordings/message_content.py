@@ -28,7 +28,7 @@ _LIVE_KEYS = frozenset({"source", "t_mono_ns"})
 def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -> dict[str, Any]:
     """Return a message of a recorded topic: this version's keys in the order of its schema, then others of the file's.
 
-    `columns` are those of the topic in its file, without it this version's. A value that is missing, or whose key the
+    `columns` describe the topic in its file; the default is this version's. A value that is missing, or whose key the
     file's schema lacks, is None. Numbers are floats, arrays are lists of floats, integers or None. An imported message
     has only the keys that its import writes. Raises UnknownTopicError for another topic and ContentError for what does
     not fit it.

@@ -114,6 +114,7 @@ async def a_bench(
             yield bench
 
 
+@pytest.mark.real_time
 @pytest.mark.parametrize(("serial_source", "adc"), [(True, True), (True, False), (False, True), (False, False)])
 async def test_resistances_come_through_over_every_way_in(tmp_path, serial_source, adc):
     async with a_bench(tmp_path, serial_source=serial_source, adc=adc) as bench:

@@ -51,8 +51,8 @@ def run(args: argparse.Namespace) -> int:
 
     from shearloop.cli.held_address import held_from_daemons
     from shearloop.cli.terminal import print_result
-    from shearloop.daemon.commissioned import commissioning_of
     from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
     from shearloop.tools.commission.operator import Operator

@@ -50,7 +50,7 @@ def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
 
     Raises UserError for a report that cannot be read.
     """
-    from shearloop.daemon.commissioned import commissioning_of
+    from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
 
     if (settings := open_settings(config)) is not None:

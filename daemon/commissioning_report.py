@@ -1,64 +1,124 @@
-"""Why the report of a rig's commissioning does not count for a configuration.
+"""The report of a rig's commissioning: its rig, its stages with their lines, and the values that they supply."""
 
-The report is a record, not a safety function. Only the pendant's safety configuration is rated.
-"""
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Final, Literal
 
-from datetime import datetime, timedelta
-from pathlib import Path
-from typing import Final
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
 
-from shearloop.daemon.commissioning import Report, StageResult
-from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
-from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
-from shearloop.errors import UserError
-from shearloop.yaml_files import load_model
+Verdict = Literal["passed", "failed", "noted"]
 
-# A report counts for this time after its oldest stage.
-MAX_AGE_DAYS: Final = 180
-# This computer's clock may be this much behind the clock that dated the report.
-_CLOCKS_DIFFER = timedelta(days=1)
+# A report raises the wrist's speed to this at most.
+FASTEST_RAD_PER_S: Final = 0.5
 
 
-def old_stages(report: Report, config: DaemonConfig) -> list[tuple[StageResult, list[str]]]:
-    """Return the stages that judged keys or files which have changed since, and these, for a sentence."""
-    hashes, found = judged_sha256s(config), []
-    for stage in report.stages:
-        own, now = stage.judged_sha256s, judged_by(stage.stage, hashes)
-        if differs := [f"`{key}`" for key in sorted({*own, *now}) if own.get(key) != now.get(key)]:
-            found.append((stage, differs))
-    return found
+class Record(BaseModel):
+    """A part of a report."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
-    """Return why a report does not count for a configuration, or an empty string."""
-    seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number, report.rig)
-    # Each of these marks is enough, so one mistake in a file cannot raise a real robot's cap.
-    is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
-    if is_emulated and not config.emulated:
-        return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
-    # In a rehearsal a report of the real devices counts too.
-    robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
-    seen = seen.model_copy(update=robot)
-    if differs := list(report.rig.differences(seen)):
-        return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
-    if old := old_stages(report, config):
-        keys = " and ".join(dict.fromkeys(key for _, differs in old for key in differs))
-        return f"{keys} changed since stage {' and '.join(one.stage for one, _ in old)} of {config.commissioned}"
-    failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
-              if line.verdict == "failed"]  # fmt: skip
-    if failed:
-        return f"{config.commissioned} says that {failed[0]} failed"
-    if not report.stages:
-        return f"{config.commissioned} has no stage"
-    dates = [stage.date for stage in report.stages]
-    if now - min(dates) > timedelta(days=MAX_AGE_DAYS):
-        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MAX_AGE_DAYS} days"
-    if max(dates) - now > _CLOCKS_DIFFER:
-        return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
-    return ""
+class Supplied(Record):
+    """Values that the daemon takes from a stage; a key that is absent was not measured."""
+
+    # Stage 4 tries no faster stop.
+    wrist_speed_rad_per_s: Annotated[float, Field(le=FASTEST_RAD_PER_S)] | None = None
+    torque_nm: float | None = None
+    torque_sources: Mapping[str, str] | None = None
+    """Sources with the right sign and scale up to `torque_nm`, beside the load cell; each with its `source_sha256`."""
+    rest_rad_per_s: float | None = None
+    actuation_s: float | None = None
+    reaction_s: float | None = None
+    stop_rad: float | None = None
+    widths: tuple[tuple[float, float], ...] | None = None
+    """Pairs of counts and mm."""
 
 
-def load_report(path: Path) -> Report:
-    """Return the report in a file; raises UserError for a file that is not a report."""
-    return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
+NOTHING_SUPPLIED: Final = Supplied()
+
+
+class RigIdentity(Record):
+    """Which rig a report is about: hashes in hexadecimal, versions, and the robot's serial number."""
+
+    emulated: bool
+    configuration_sha256: str
+    robot_settings_sha256: str
+    script_sha256: str
+    ur_rtde: str
+    polyscope: str
+    robot_serial_number: str
+
+    def differences(self, other: "RigIdentity") -> Iterator[str]:
+        """Yield each difference in words."""
+        for key, what in _IDENTITY.items():
+            if getattr(self, key) != getattr(other, key):
+                yield what
+
+
+_IDENTITY: Final = {
+    "emulated": "`emulated`",
+    "configuration_sha256": "the devices in the configuration",
+    "robot_settings_sha256": "the robot's settings",
+    "script_sha256": "the script for the robot",
+    "ur_rtde": "the version of ur-rtde",
+    "polyscope": "the version of PolyScope",
+    "robot_serial_number": "the robot's serial number",
+}
+
+
+class Line(Record):
+    """One measured or noted value: its name, its limit, the number of measurements, and the promise it checks."""
+
+    what: str
+    value: str
+    limit: str = ""
+    count: int = 1
+    promise: str = ""
+    verdict: Verdict = "noted"
+
+
+class StageResult(Record):
+    """The lines of one stage, who ran it, and when.
+
+    `judged_sha256s`: hashes of the keys and files that only this stage or a few stages judge, in hexadecimal.
+    `RigIdentity` has the hashes for all stages.
+    """
+
+    stage: str
+    operator: str
+    date: AwareDatetime
+    lines: tuple[Line, ...]
+    supplies: Supplied = NOTHING_SUPPLIED
+    judged_sha256s: Mapping[str, str] = {}
+
+    @property
+    def passed(self) -> bool:
+        """Whether no line failed."""
+        return all(line.verdict != "failed" for line in self.lines)
+
+
+class Report(Record):
+    """All stages of one rig."""
+
+    version: Literal[3] = 3
+    rig: RigIdentity
+    stages: tuple[StageResult, ...] = ()
+
+    @property
+    def passed(self) -> bool:
+        """Whether the report has a stage, and no stage has a failed line."""
+        return bool(self.stages) and all(stage.passed for stage in self.stages)
+
+    def stage(self, number: str) -> StageResult | None:
+        """Return the stage with this figure at the beginning of its name, if it was run."""
+        return next((stage for stage in self.stages if stage.stage.startswith(number)), None)
+
+    def supplied(self) -> Supplied:
+        """Return the values of all stages."""
+        values: dict[str, object] = {}
+        for stage in self.stages:
+            values |= stage.supplies.model_dump(exclude_none=True)
+        return Supplied.model_validate(values)
+
+    def has(self, numbers: str) -> bool:
+        """Return whether all of these stages were run."""
+        return all(self.stage(number) is not None for number in numbers)

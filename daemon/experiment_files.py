@@ -21,12 +21,12 @@ from typing import NamedTuple, TypeVar
 
 import structlog
 
-from shearloop.daemon.commissioning import Commissioning, MotionCap
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_check import experiment_mistakes
 from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.motion_cap import Commissioning, MotionCap
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 from shearloop.files import read_file

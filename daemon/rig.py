@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Commissioning, Supplied, measured_widths
+from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Supplied
 from shearloop.daemon.config import DaemonConfig, GripperConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
@@ -22,8 +21,10 @@ from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.motion_cap import Commissioning, measured_widths
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError
+from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig_memory import NoMemory, RigMemory
 from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources

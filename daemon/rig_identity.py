@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
-from shearloop.daemon.commissioning import RigIdentity
+from shearloop.daemon.commissioning_report import RigIdentity
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER

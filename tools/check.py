@@ -15,11 +15,11 @@ from shearloop.errors import UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
-    from shearloop.daemon.commissioning import Commissioning
     from shearloop.daemon.config import CurveConfig, DaemonConfig, EmulatorConfig, SkinConfig
     from shearloop.daemon.control.experiment_schema import ExperimentFile, Mistake
     from shearloop.daemon.control.plan import Plan
     from shearloop.daemon.loop_config import LoopConfig
+    from shearloop.daemon.motion_cap import Commissioning
     from shearloop.daemon.torques import TorqueSource
     from shearloop.drivers.robotiq.models import GripperModel
     from shearloop.drivers.ur.settings import UrLimits
@@ -192,7 +192,7 @@ def _torque(calibration: "Calibration") -> str:
 
 def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
     """Check load cell, gripper and robot; return the robot's settings with their cap, if there are any."""
-    from shearloop.daemon.commissioned import commissioning_of
+    from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import configured_settings, gripper_calibration, why_not_driven
     from shearloop.daemon.sensors import load_cell_calibration
 

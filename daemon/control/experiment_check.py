@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.daemon.commissioning import Commissioning, MotionCap, knows_tool
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
@@ -28,6 +27,7 @@ from shearloop.daemon.control.experiment_schema import (
     outline,
 )
 from shearloop.daemon.control.step_demands import demand
+from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
 from shearloop.daemon.torques import LOAD_CELL, WRENCH, TorqueSource
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits

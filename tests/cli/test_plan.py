@@ -8,13 +8,13 @@ import pytest
 import yaml
 
 from shearloop.cli import main
-from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.motion_cap import Commissioning
 from shearloop.daemon.operator_questions import question_of
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.drivers.ur.settings import UrLimits, read_settings

@@ -11,22 +11,13 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.cli.rehearsed_config import RehearsedConfig
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import (
-    CAPPED_M_PER_S,
-    CAPPED_NM,
-    CAPPED_RAD_PER_S,
-    NOTHING_SUPPLIED,
-    Line,
-    Report,
-    StageResult,
-    Supplied,
-    measured_widths,
-)
-from shearloop.daemon.commissioning_report import MAX_AGE_DAYS
+from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Line, Report, StageResult, Supplied
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S, measured_widths
+from shearloop.daemon.report_in_use import commissioning_of
+from shearloop.daemon.report_validity import MAX_AGE_DAYS
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
 from shearloop.drivers.ur.client import UrRobot

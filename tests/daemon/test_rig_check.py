@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
-from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.experiment_files import ExperimentFiles, check_experiment
 from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.motion_cap import Commissioning
 from shearloop.daemon.sensing.sessions import torque_sources
 from shearloop.daemon.torques import TorqueSource
 from shearloop.drivers.ur.settings import ForceBound, TorqueBound, read_settings

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import DaemonConfig, SkinConfig
 from shearloop.daemon.sensing.skin_task import tool_radius_m
 from shearloop.drivers.eit_kit import Frame

@@ -5,7 +5,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from shearloop.daemon.commissioning import Report
+from shearloop.daemon.commissioning_report import Report
 from shearloop.daemon.config import DaemonConfig
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.recovery import ENDS_ITSELF_S

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Final
 
-from shearloop.daemon.commissioning import Line, Supplied
+from shearloop.daemon.commissioning_report import Line, Supplied
 from shearloop.daemon.config import GripperConfig
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS

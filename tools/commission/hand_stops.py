@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.drivers.ur.messages import SAFETY_EMERGENCY_STOPS, SAFETY_MODES
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, replace
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ur.control_box import ControllerInfo, untested
 from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_sentence, tool_difference

@@ -6,9 +6,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning import Report, StageResult, why_not_emulated
-from shearloop.daemon.commissioning_report import old_stages
+from shearloop.daemon.commissioning_report import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.motion_cap import why_not_emulated
+from shearloop.daemon.report_validity import old_stages
 from shearloop.daemon.rig import gripper_calibration, open_settings
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.robot_files import RobotFiles, lock_robot

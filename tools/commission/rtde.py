@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Final
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.errors import UserError
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.limits import REAL, TimeLimits

@@ -4,7 +4,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Final
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.sensing.skin_estimator import MAX_DEVIATION, MAX_NOISE, are_exchanged
 from shearloop.drivers.shear_skin.skin import MAX_CHANGE, STUCK_AFTER, SkinFault, SkinSample
 from shearloop.estimation.skin.calibration import SkinCalibration

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from shearloop.bank.channels import ChannelTable
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.shear_skin.skin import SkinSample

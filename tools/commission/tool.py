@@ -6,8 +6,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from shearloop.daemon.commissioning import CAPPED_NM, Line, Supplied
+from shearloop.daemon.commissioning_report import Line, Supplied
 from shearloop.daemon.control.experiment_schema import SIGNS, direction_of
+from shearloop.daemon.motion_cap import CAPPED_NM
 from shearloop.daemon.rig_identity import source_sha256
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.load_cell import LoadSample

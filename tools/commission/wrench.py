@@ -8,7 +8,7 @@ from typing import Final
 
 from scipy import constants
 
-from shearloop.daemon.commissioning import Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.drivers.ur.settings import Six, UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S

@@ -13,9 +13,9 @@ from typing import NamedTuple, Self
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import BankError
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import knows_tool
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, GripperConfig, load_daemon_config
+from shearloop.daemon.motion_cap import knows_tool
+from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig import configured_settings
 from shearloop.daemon.running_rig import EMULATED
 from shearloop.drivers.errors import DriverError

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import why_not_emulated
 from shearloop.daemon.config import DaemonConfig, GripperConfig, SkinConfig
 from shearloop.daemon.messaging.client import receive_messages, send_command
 from shearloop.daemon.messaging.stop_client import send_to_stop_socket
+from shearloop.daemon.motion_cap import why_not_emulated
+from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.running_rig import RunningRig
 from shearloop.daemon.sensing.skin_task import current_source, voltage_reader

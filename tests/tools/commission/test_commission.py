@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from shearloop.cli import main, other_daemon
-from shearloop.daemon.commissioning import Line, Report, RigIdentity, StageResult
+from shearloop.daemon.commissioning_report import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.daemon.commissioning import NOTHING_SUPPLIED
+from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample

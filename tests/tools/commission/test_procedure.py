@@ -11,9 +11,9 @@ import yaml
 
 from benchmarks.stop_times import write_random_bank
 from shearloop.bank.bank_file import Bank
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import NOTHING_SUPPLIED, Line
+from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Line
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission import stops
 from shearloop.tools.commission.bounds import LARGEST_RAD

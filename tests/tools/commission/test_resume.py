@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from shearloop.daemon.commissioning import Line, Verdict
-from shearloop.daemon.commissioning_report import load_report
+from shearloop.daemon.commissioning_report import Line, Verdict
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.report_validity import load_report
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.script import LOWER, UPPER

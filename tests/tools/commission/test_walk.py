@@ -13,10 +13,10 @@ import pytest
 import yaml
 
 from shearloop.cli.rehearsal import rehearsal, sentences_of_run
-from shearloop.daemon.commissioned import commissioning_of
-from shearloop.daemon.commissioning import CAPPED_NM, CAPPED_RAD_PER_S
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.experiment_files import check_experiment
+from shearloop.daemon.motion_cap import CAPPED_NM, CAPPED_RAD_PER_S
+from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig import open_settings
 from shearloop.errors import UserError
 from shearloop.tools.commission.operator import Operator

@@ -2,8 +2,8 @@
 
 from datetime import UTC, datetime
 
-from shearloop.daemon.commissioning import Commissioning
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.motion_cap import Commissioning
 from shearloop.daemon.torques import LOAD_CELL
 from shearloop.drivers.ur.settings import UrSettings
 
@@ -19,7 +19,7 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
         return Commissioning(settings, None, emulated=True)
     if config.commissioned is None:
         return Commissioning(settings, None, "`commissioned` is not in the configuration", rehearsed=rehearsed)
-    from shearloop.daemon.commissioning_report import load_report, old_stages, why_not
+    from shearloop.daemon.report_validity import load_report, old_stages, why_not
     from shearloop.daemon.rig_identity import source_sha256
 
     report = load_report(config.commissioned)

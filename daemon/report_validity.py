@@ -1,0 +1,64 @@
+"""Why the report of a rig's commissioning does not count for a configuration.
+
+The report is a record, not a safety function. Only the pendant's safety configuration is rated.
+"""
+
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from shearloop.daemon.commissioning_report import Report, StageResult
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
+from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
+from shearloop.errors import UserError
+from shearloop.yaml_files import load_model
+
+# A report counts for this time after its oldest stage.
+MAX_AGE_DAYS: Final = 180
+# This computer's clock may be this much behind the clock that dated the report.
+_CLOCKS_DIFFER = timedelta(days=1)
+
+
+def old_stages(report: Report, config: DaemonConfig) -> list[tuple[StageResult, list[str]]]:
+    """Return the stages that judged keys or files which have changed since, and these, for a sentence."""
+    hashes, found = judged_sha256s(config), []
+    for stage in report.stages:
+        own, now = stage.judged_sha256s, judged_by(stage.stage, hashes)
+        if differs := [f"`{key}`" for key in sorted({*own, *now}) if own.get(key) != now.get(key)]:
+            found.append((stage, differs))
+    return found
+
+
+def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
+    """Return why a report does not count for a configuration, or an empty string."""
+    seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number, report.rig)
+    # Each of these marks is enough, so one mistake in a file cannot raise a real robot's cap.
+    is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
+    if is_emulated and not config.emulated:
+        return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
+    # In a rehearsal a report of the real devices counts too.
+    robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
+    seen = seen.model_copy(update=robot)
+    if differs := list(report.rig.differences(seen)):
+        return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
+    if old := old_stages(report, config):
+        keys = " and ".join(dict.fromkeys(key for _, differs in old for key in differs))
+        return f"{keys} changed since stage {' and '.join(one.stage for one, _ in old)} of {config.commissioned}"
+    failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
+              if line.verdict == "failed"]  # fmt: skip
+    if failed:
+        return f"{config.commissioned} says that {failed[0]} failed"
+    if not report.stages:
+        return f"{config.commissioned} has no stage"
+    dates = [stage.date for stage in report.stages]
+    if now - min(dates) > timedelta(days=MAX_AGE_DAYS):
+        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MAX_AGE_DAYS} days"
+    if max(dates) - now > _CLOCKS_DIFFER:
+        return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
+    return ""
+
+
+def load_report(path: Path) -> Report:
+    """Return the report in a file; raises UserError for a file that is not a report."""
+    return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")

@@ -52,6 +52,8 @@ class CommandHandler:
         # Whether messages that came late can be that reason.
         self._disabled_late = False
         self._daemon_alive_ns = now_ns
+        # Whether every sample since our program started shows a program: then it is still ours, also while paused.
+        self._program_is_ours = False
         # Whether a tool may load the wrench, as the daemon says.
         self._held_tool = False
         # Whether the daemon disconnects: only stops are accepted from then on.
@@ -77,6 +79,8 @@ class CommandHandler:
     def take(self, sample: RtdeSample) -> None:
         """Take and judge the robot's latest sample; `request`, `tick` and `state` are about it."""
         self._sample, self._unfit = sample, why_unfit(sample, self._settings)
+        if not (sample.has_program and is_recent(sample, self._settings)):
+            self._program_is_ours = False
         self._executor.take(sample)
 
     def request(self, number: int, command: Command | Heartbeat, now_ns: int) -> CommandReply | None:
@@ -103,7 +107,8 @@ class CommandHandler:
             case Unlock() if unfit:
                 if not self._executor.why_not_ours:
                     self._executor.disable(unfit)
-                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, number)
+                timeout_s, ours = self._settings.recover_timeout_s, self._program_is_ours
+                self._recovery = Recovery(self._arm, now_ns, timeout_s, number, ours=ours)
                 self._recovery.held = self._held_tool
                 return None
             case _ if self._recovery is not None:
@@ -227,6 +232,7 @@ class CommandHandler:
         self._recovery = None
         if recovery.ready:
             self._executor.enable()
+            self._program_is_ours = True
         if recovery.unlock_number is None:
             self._why_not_enabled = recovery.refusal or self._why_not_enabled
             return None

@@ -221,9 +221,14 @@ class RtdeSample(RtdeOutputs):
         return self.runtime_state == RUNTIME_PLAYING
 
     @property
+    def has_program(self) -> bool:
+        """Whether a program is on the robot: it plays, is paused, or is pausing or resuming."""
+        return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED)
+
+    @property
     def program_paused(self) -> bool:
         """Whether a program is paused, or is pausing or resuming."""
-        return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED, RUNTIME_PLAYING)
+        return self.has_program and not self.program_running
 
     @property
     def robot_mode_name(self) -> str:

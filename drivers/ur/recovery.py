@@ -35,7 +35,7 @@ NOT_STARTING = (
     "control, and for the log's last lines. The robot's worker is started again with motion disabled."
 )
 ANOTHERS_PROGRAM = (
-    "The program that runs on the robot may be another daemon's: another client writes the robot's input registers. An "
+    "The program on the robot may be another daemon's: another client writes the robot's input registers. An "
     "unlock would bypass a stop that waits there. End the other daemon, or stop the program at the pendant, then "
     "unlock again."
 )
@@ -48,8 +48,13 @@ class Recovery:
     unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
     """
 
-    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None) -> None:
-        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping any program."""
+    def __init__(
+        self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None, *, ours: bool = False
+    ) -> None:
+        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping a program.
+
+        `ours`: the program that is on the robot now was started by this worker.
+        """
         self.unlock_number = unlock_number
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
@@ -59,8 +64,8 @@ class Recovery:
         self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
         self._cleared = False
-        # Whether the program that runs may be another client's; None until it was asked.
-        self._others: bool | None = None
+        # Whether the program that is on the robot may be another client's; None until it was asked.
+        self._others = False if ours else None
         # When the control program was first sent.
         self._uploaded_ns: int | None = None
         # The controller's latest refusal of a request that could be done without.
@@ -107,6 +112,12 @@ class Recovery:
         return self.ready or self.refusal is not None
 
     def _step(self, sample: RtdeSample, now_ns: int) -> None:
+        if self.operator_asked and self._uploaded_ns is None and sample.has_program:
+            if self._others is None:
+                self._others = self._arm.has_other_client()
+            if self._others:
+                self._wait_for_its_end(sample, now_ns)
+                return
         safe = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
         if not (safe and sample.robot_mode == ROBOT_MODE_RUNNING):
             self._make_safe(sample, now_ns, safe)
@@ -117,7 +128,7 @@ class Recovery:
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
             if self.operator_asked:
-                self._stop_program(sample, now_ns)
+                self._ask_dashboard(now_ns, "stop")
             elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
                 # Not ours to stop. After the death of its daemon its watchdog would have ended it.
                 self.refusal = ""
@@ -158,14 +169,11 @@ class Recovery:
             elif sample.robot_mode == ROBOT_MODE_IDLE:
                 self._ask_dashboard(now_ns, "brake release")
 
-    def _stop_program(self, sample: RtdeSample, now_ns: int) -> None:
-        """Stop a program, unless another client has it: its own stop may wait for its operator."""
-        if sample.program_running and self._others is None:
-            self._others = self._arm.has_other_client()
-        if not (sample.program_running and self._others):
-            self._ask_dashboard(now_ns, "stop")
-        elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
-            # The program of a worker that has ended would have ended by itself.
+    def _wait_for_its_end(self, sample: RtdeSample, now_ns: int) -> None:
+        """Leave a program to another client, whose own stop may wait for its operator."""
+        begun_ns = self._asked_ns.setdefault("end", now_ns)
+        # A program that plays ends by itself if its worker has ended. A paused one does not.
+        if sample.program_paused or now_ns > begun_ns + int(ENDS_ITSELF_S * 1e9):
             self.refusal = ANOTHERS_PROGRAM
 
     def _close_popups(self, now_ns: int) -> None:

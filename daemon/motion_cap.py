@@ -14,7 +14,7 @@ from shearloop.drivers.robotiq.models import ModelName
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
-from shearloop.errors import UserError
+from shearloop.errors import Hint, UserError
 
 BoundT = TypeVar("BoundT", bound=Bound)
 
@@ -24,10 +24,18 @@ CAPPED_M_PER_S: Final = 0.05
 CAPPED_NM: Final = 0.3
 # A measured value beyond this multiple of a capped speed stops the motion.
 _HARD: Final = 1.6
-CURE: Final = "run `shearloop commission CONFIG --out FILE{options}`"
+# Without the closing quote, for options. A report is continued in its own file.
+CONTINUE: Final = "run `shearloop commission CONFIG --out FILE"
 # The stages that a quantity's limits depend on, by the first figure of their names.
 _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
+
+
+def new_report(file: str = "NEW_FILE", *, emulated: bool = False) -> str:
+    """Return the cure where no report can be continued; `emulated`: one of emulated devices helps."""
+    options = " --emulate" if emulated else ""
+    made = f"run `shearloop commission CONFIG --out {file}{options}`"
+    return f"{made}, then write `commissioned: {file}` into the configuration"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,33 +75,30 @@ class MotionCap:
 class Commissioning:
     """The robot's settings within its report. An emulated robot needs no report, unless it plays a real robot.
 
-    `reason` says why the report, or its absence, raises nothing. It is empty for a report that counts. `emulated` means
+    `reason` says why the report raises nothing, and what helps. It is None for a report that counts. `emulated` means
     a robot without a cap, `rehearsed` an emulated robot with the cap of the real one. The report raises the torque of
-    `torque_sources`. `old_stages` are to be measured again, by their first figures.
+    `torque_sources`.
     """
 
     given: UrSettings
     report: Report | None
-    reason: str = ""
+    reason: Hint | None = None
     emulated: bool = False
     rehearsed: bool = False
     torque_sources: tuple[str, ...] = ()
-    old_stages: str = ""
     # How the connected controller differs from the report's.
-    _other: str = field(default="", init=False)
+    _other: Hint | None = field(default=None, init=False)
 
     @property
     def cap(self) -> MotionCap | None:
         """The present cap; None for an emulated robot that plays no real robot."""
         if self.emulated:
             return None
-        if self.report is None or not self.counts:
-            options = " --emulate" if self.rehearsed else ""
-            if self.old_stages:
-                cure = CURE.format(options=f"{options} --stages {self.old_stages}")
-            else:
-                cure = f"{CURE.format(options=options)}, then write `commissioned: FILE` into the configuration"
-            return MotionCap(self.reason or self._other, cure)
+        if self.report is None:
+            cure = new_report("FILE", emulated=self.rehearsed)
+            return MotionCap("`commissioned` is not in the configuration", cure)
+        if why := self.reason or self._other:
+            return MotionCap(*why)
         found = self.report.supplied()
         wrist_rad_per_s = found.wrist_speed_rad_per_s if self.report.has(_SPEED_NEEDS) else None
         torque_nm = (found.torque_nm if self.report.has(_TORQUE_NEEDS) else None) or 0.0
@@ -152,7 +157,8 @@ class Commissioning:
         if self.report is not None and not self.rehearsed:
             seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
             differs = list(self.report.rig.differences(self.report.rig.model_copy(update=seen)))
-            self._other = f"{' and '.join(differs)} changed since its report" if differs else ""
+            changed = f"{' and '.join(differs)} changed since its report"
+            self._other = Hint(changed, new_report()) if differs else None
         return self.settings
 
     @property

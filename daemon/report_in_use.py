@@ -18,8 +18,8 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
     if config.emulated and not rehearsed:
         return Commissioning(settings, None, emulated=True)
     if config.commissioned is None:
-        return Commissioning(settings, None, "`commissioned` is not in the configuration", rehearsed=rehearsed)
-    from shearloop.daemon.report_validity import load_report, old_stages, why_not
+        return Commissioning(settings, None, rehearsed=rehearsed)
+    from shearloop.daemon.report_validity import load_report, why_not
     from shearloop.daemon.rig_identity import source_sha256
 
     report = load_report(config.commissioned)
@@ -27,7 +27,4 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
     measured = {} if reason else report.supplied().torque_sources or {}
     # After another calibration, sign and scale are not known.
     same = (name for name, own in sorted(measured.items()) if source_sha256(config, name) == own)
-    old = "".join(stage.stage[0] for stage, _ in old_stages(report, config)) if reason else ""
-    return Commissioning(
-        settings, report, reason, rehearsed=rehearsed, torque_sources=(LOAD_CELL, *same), old_stages=old
-    )
+    return Commissioning(settings, report, reason, rehearsed=rehearsed, torque_sources=(LOAD_CELL, *same))

@@ -3,15 +3,17 @@
 The report is a record, not a safety function. Only the pendant's safety configuration is rated.
 """
 
+from collections.abc import Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
 from shearloop.daemon.commissioning_report import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.motion_cap import CONTINUE, new_report
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
-from shearloop.errors import UserError
+from shearloop.errors import Hint, UserError
 from shearloop.yaml_files import load_model
 
 # A report counts for this time after its oldest stage.
@@ -30,33 +32,44 @@ def old_stages(report: Report, config: DaemonConfig) -> list[tuple[StageResult, 
     return found
 
 
-def why_not(report: Report, config: DaemonConfig, now: datetime) -> str:
-    """Return why a report does not count for a configuration, or an empty string."""
+def why_not(report: Report, config: DaemonConfig, now: datetime) -> Hint | None:
+    """Return why a report does not count for a configuration, with the cure, or None."""
+    name, rehearsed = config.commissioned, config.real is not config
     seen = identity_of(config, report.rig.polyscope, report.rig.robot_serial_number, report.rig)
     # Each of these marks is enough, so one mistake in a file cannot raise a real robot's cap.
     is_emulated = report.rig.emulated or report.rig.robot_serial_number == EMULATED_SERIAL_NUMBER
     if is_emulated and not config.emulated:
-        return f"{config.commissioned} is of emulated devices, and raises nothing on real ones"
+        return Hint(f"{name} is of emulated devices, and raises nothing on real ones", new_report())
     # In a rehearsal a report of the real devices counts too.
     robot = {key: getattr(report.rig, key) for key in ("emulated", "robot_serial_number")}
     seen = seen.model_copy(update=robot)
     if differs := list(report.rig.differences(seen)):
-        return f"{' and '.join(differs)} changed since {config.commissioned} was measured"
+        changed = f"{' and '.join(differs)} changed since {name} was measured"
+        return Hint(changed, new_report(emulated=rehearsed))
+    # A report of real devices is continued on these, also if a rehearsal uses it.
+    again = CONTINUE + " --emulate" * is_emulated
     if old := old_stages(report, config):
         keys = " and ".join(dict.fromkeys(key for _, differs in old for key in differs))
-        return f"{keys} changed since stage {' and '.join(one.stage for one, _ in old)} of {config.commissioned}"
+        cause = f"{keys} changed since stage {' and '.join(one.stage for one, _ in old)} of {name}"
+        return Hint(cause, _measure_again(again, [stage for stage, _ in old]))
     failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
               if line.verdict == "failed"]  # fmt: skip
     if failed:
-        return f"{config.commissioned} says that {failed[0]} failed"
+        return Hint(f"{name} says that {failed[0]} failed", f"mend the cause, and {again}`")
     if not report.stages:
-        return f"{config.commissioned} has no stage"
-    dates = [stage.date for stage in report.stages]
-    if now - min(dates) > timedelta(days=MAX_AGE_DAYS):
-        return f"{config.commissioned} is of {min(dates):%Y-%m-%d}, older than {MAX_AGE_DAYS} days"
-    if max(dates) - now > _CLOCKS_DIFFER:
-        return f"{config.commissioned} is of {max(dates):%Y-%m-%d}, which is in the future by this computer's clock"
-    return ""
+        return Hint(f"{name} has no stage", f"{again}`")
+    if expired := [stage for stage in report.stages if now - stage.date > timedelta(days=MAX_AGE_DAYS)]:
+        date = min(stage.date for stage in expired)
+        return Hint(f"{name} is of {date:%Y-%m-%d}, older than {MAX_AGE_DAYS} days", _measure_again(again, expired))
+    if early := [stage for stage in report.stages if stage.date - now > _CLOCKS_DIFFER]:
+        date = max(stage.date for stage in early)
+        cause = f"{name} is of {date:%Y-%m-%d}, which is in the future by this computer's clock"
+        return Hint(cause, f"set the clock, or {_measure_again(again, early)}")
+    return None
+
+
+def _measure_again(again: str, stages: Sequence[StageResult]) -> str:
+    return f"{again} --stages {''.join(stage.stage[0] for stage in stages)}`"
 
 
 def load_report(path: Path) -> Report:

@@ -116,6 +116,12 @@ def with_a_stage_of(report: Report, date: datetime) -> Report:
     return report.model_copy(update={"stages": (*stages, last.model_copy(update={"date": date}))})
 
 
+def with_a_failed_line(report: Report) -> Report:
+    first, *others = report.stages
+    failed = first.model_copy(update={"lines": (Line(what="w", value="v", verdict="failed"),)})
+    return report.model_copy(update={"stages": (failed, *others)})
+
+
 @pytest.mark.parametrize(
     ("change", "now", "why"),
     [
@@ -138,6 +144,61 @@ def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, chan
     assert why in found.cap.why
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
     assert found.supplied == NOTHING_SUPPLIED
+
+
+NEW = "run `shearloop commission CONFIG --out NEW_FILE`, then write `commissioned: NEW_FILE` into the configuration"
+AGAIN = "run `shearloop commission CONFIG --out FILE"
+
+
+@pytest.mark.parametrize(
+    ("change", "now", "cure"),
+    [
+        (lambda report: changed(report, emulated=True), NOW, NEW),
+        (lambda report: changed(report, configuration_sha256="0"), NOW, NEW),
+        (lambda report: report.model_copy(update={"stages": ()}), NOW, f"{AGAIN}`"),
+        (with_a_failed_line, NOW, f"mend the cause, and {AGAIN}`"),
+        (lambda report: with_a_stage_of(report, NOW - timedelta(days=181)), NOW, f"{AGAIN} --stages 7`"),
+        (
+            lambda report: with_a_stage_of(report, NOW + timedelta(days=2)),
+            NOW,
+            f"set the clock, or {AGAIN} --stages 7`",
+        ),
+    ],
+)
+def test_each_reason_against_a_report_has_the_cure_that_removes_it(tmp_path, change, now, cure):
+    """Values that two stages judge have changed too, and measuring these again would not be enough."""
+    report = report_of(write_rig(tmp_path), "013457", SUPPLIED)
+    save_report(tmp_path / "report.yaml", change(report))
+    path = write_rig(tmp_path, commissioned="report.yaml")
+    if cure == NEW:
+        rewrite(tmp_path / "ur.yaml", reaction_s=0.05)
+    config = load_daemon_config(path)
+    assert commissioning_of(config, read_settings(config.robot), now).cap.cure == cure
+
+
+def test_another_controller_needs_a_new_report(tmp_path):
+    found = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", SUPPLIED))
+    found.on_controller(VERSION, "20235500002")
+    assert found.cap.cure == NEW
+
+
+def test_a_rehearsal_continues_a_report_on_the_devices_that_it_is_of(tmp_path):
+    for emulated, option in ((True, " --emulate"), (False, "")):
+        report = changed(report_of(write_rig(tmp_path), "013457", SUPPLIED), emulated=emulated)
+        found = rehearsing(tmp_path, with_a_stage_of(report, NOW - timedelta(days=181)))
+        assert found.cap.cure == f"{AGAIN}{option} --stages 7`"
+
+
+def test_a_file_that_a_stage_judged_is_hashed_once(tmp_path, monkeypatch):
+    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(CELL))
+    cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
+    save_report(tmp_path / "report.yaml", report_of(write_rig(tmp_path, load_cell=cell), "0134567", SUPPLIED))
+    config = load_daemon_config(write_rig(tmp_path, load_cell=cell, commissioned="report.yaml"))
+    rewrite(tmp_path / "cell.yaml", scale_n_per_count=0.002)
+    read, read_bytes = [], Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or read_bytes(path))
+    assert not commissioning_of(config, read_settings(config.robot), NOW).counts
+    assert read.count("cell.yaml") == 1
 
 
 def rehearsing(folder: Path, report: Report | None, **content: object):

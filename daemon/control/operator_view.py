@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, Step
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD
@@ -136,15 +136,19 @@ class OperatorView:
             return ""
         return f"the stop that waits is not the one that was shown: {stop.causes}"
 
+    def dropping_step(self, file: ExperimentFile) -> tuple[int, Step] | None:
+        """Return the first step that lets go of what the fingers hold now, or may hold, with its number; else None."""
+        if self.tool.any_object is None:
+            return None
+        width_mm = self.inputs.gripper.width_mm if self.inputs.gripper is not None else 0.0
+        return first_opening(file, width_mm, activates=self.tool.activates)
+
     def drop_sentence(self, file: ExperimentFile) -> str:
         """Return which step lets go of what the fingers hold now, or may hold; empty if none does."""
-        gripper, held = self.inputs.gripper, self.tool.any_object
-        width_mm = gripper.width_mm if gripper is not None else 0.0
-        first = first_opening(file, width_mm, activates=self.tool.activates)
-        if held is None or first is None:
-            return ""
-        number, step = first
-        return f"step {number} ({step.do}) opens the gripper, and a tool in it drops; {held}"
+        match self.dropping_step(file):
+            case (number, step):
+                return f"step {number} ({step.do}) opens the gripper, and a tool in it drops; {self.tool.any_object}"
+        return ""
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""

@@ -65,12 +65,16 @@ def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
 
 
 def first_opening(file: ExperimentFile, width_mm: float, *, activates: bool) -> tuple[int, Step] | None:
-    """Return the first step that opens fingers that are `width_mm` apart, with its number from 1, or None.
+    """Return the first step that may open fingers that are `width_mm` apart, with its number from 1, or None.
 
     `activates`: the first step that moves them activates the gripper, which opens them.
     """
     for number, step in enumerate(file.steps, 1):
-        opens = isinstance(step, GripStep) and (activates or step.width_mm > width_mm)
-        if opens or isinstance(step, ReleaseStep):
+        if isinstance(step, GripStep):
+            if activates or step.width_mm > width_mm:
+                return number, step
+            # The fingers may close as far as that, on a thinner tool.
+            width_mm = step.width_mm
+        elif isinstance(step, ReleaseStep):
             return number, step
     return None

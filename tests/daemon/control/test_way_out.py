@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.commands import Commands
+from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
@@ -21,11 +22,12 @@ from shearloop.daemon.control.loop_runner import UNSEEN_S
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.experiment_files import ReadExperiment
+from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.stop_client import nothing_moved
-from shearloop.daemon.operator_questions import held_note, release_question
+from shearloop.daemon.operator_questions import held_note, question_of, release_question
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
@@ -560,6 +562,11 @@ def test_the_question_before_a_turn_says_what_is_held():
 
 
 OPENS = "(release) opens the gripper, and a tool in it drops; "
+OPENS_BY_GRIP = OPENS.replace("release", "grip")
+
+
+def grip_to(width_mm: float) -> dict[str, Any]:
+    return {"do": "grip", "width_mm": width_mm}
 
 
 @pytest.mark.parametrize(
@@ -572,6 +579,10 @@ OPENS = "(release) opens the gripper, and a tool in it drops; "
         ({}, [GRIP, {"do": "grip", "width_mm": 140.0}], "step 2 (grip) opens the gripper, and a tool in it drops"),
         ({"uncertain": True}, [{"do": "release"}], f"step 1 {OPENS}the gripper does not know whether it holds a tool"),
         ({"unfelt": True}, [{"do": "grip", "width_mm": 140.0}], "step 1 (grip) opens the gripper, and a tool in it"),
+        # Less wide than the fingers are at the start, and wider than the grip before.
+        ({"uncertain": True}, [grip_to(20.0), WAIT, grip_to(25.0)], f"step 3 {OPENS_BY_GRIP}"),
+        ({}, [grip_to(20.0), grip_to(15.0), grip_to(20.0)], f"step 3 {OPENS_BY_GRIP}"),
+        ({"uncertain": True}, [grip_to(20.0), WAIT, grip_to(20.0), grip_to(10.0)], None),
         ({"uncertain": True}, [GRIP, WAIT], None),
         ({}, [GRIP, TURN], None),
         ({}, [TURN], None),
@@ -590,6 +601,24 @@ def test_no_start_lets_a_held_tool_go_without_a_confirmation(sense, steps, said)
     assert refused.endswith("; secure it, then confirm it with `shearloop command start --yes`")
     assert rig.control_loop.running_experiment is None
     assert rig.control_loop.start(file, rig.t_ns, confirmed=True) is None
+
+
+def test_the_question_before_a_start_is_another_one_where_another_step_drops_the_tool(tmp_path):
+    """The fingers have closed since the question: another step opens them, which nobody has confirmed."""
+    rig = held(uncertain=True)
+    config = DaemonConfig.model_validate({"fingertips": {"right": {"device": {"path": "right"}}}})
+    files = ExperimentFiles((), config, rig.control_loop.sources, None, LoadedFiles(()))
+    file = ExperimentFile.model_validate({"name": "test", "steps": [grip_to(80.0), WAIT]})
+    read = ReadExperiment(tmp_path, file, b"the bytes of its file")
+
+    def digest_at(width_mm: float) -> str:
+        rig.width_mm = width_mm
+        rig.run(0.1)
+        return question_of(read, files, rig.control_loop).digest
+
+    at_100_mm = digest_at(100.0)
+    assert digest_at(99.0) == at_100_mm, "the width wavers"
+    assert digest_at(60.0) != at_100_mm
 
 
 def test_a_start_with_empty_fingers_asks_nothing():

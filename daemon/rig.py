@@ -275,9 +275,9 @@ class Rig:
         if (reason := deadline.why_passed("reading its file", _SLOW_FILE)) is not None:
             return reason
         try:
-            if (reason := await self.memory.begins(experiment.file.name)) is not None:
-                return reason
-            reason = await self.runner.start(experiment.file, stops_before, deadline, confirmed=confirmed)
+            reason = await self.memory.begins(experiment.file.name) or deadline.why_passed("keeping the rig's state")
+            if reason is None:
+                reason = await self.runner.start(experiment.file, stops_before, deadline, confirmed=confirmed)
         finally:
             self.memory.begun()
         if reason is None and self.recorder is not None:

@@ -259,32 +259,41 @@ class ControlLoop:
     def start_refusal(self) -> str | None:
         """Return why no experiment at all can begin, by the latest tick, or None.
 
-        Whether a torque is too large depends on the experiment. A pause of the loop is over once it is found.
+        Whether a torque is too large depends on the experiment.
         """
         if (reason := self.operator.start_refusal()) is not None:
             return reason
-        found = self._unless_enabled_by_start(
-            detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self._ticked_ns)
-        )
-        lasting = [one for one in found if not one.rule.is_past and one.code is not FaultCode.TORQUE_LIMIT]
-        return _refusal_by(lasting) or self._awaited_judgement()
+        found = detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self._ticked_ns)
+        of_any = [fault for fault in self._lasting(found) if fault.code is not FaultCode.TORQUE_LIMIT]
+        return _refusal_by(of_any) or self._awaited_judgement()
 
-    def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:
-        """Begin an experiment; return None, or why it cannot begin; `confirmed`: a held tool may drop."""
+    def refusal_of(
+        self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False, is_enabled: bool = True
+    ) -> str | None:
+        """Return why an experiment cannot begin, or None; `confirmed`: a held tool may drop.
+
+        `is_enabled`: the arm has been enabled for it, else it will be.
+        """
         if (reason := self.operator.start_refusal()) is not None:
             return reason
         if self.inputs.gripper is not None:
             # What other programs asked for before the start is no fault of this experiment.
             self.tool.judge(self.inputs.gripper)
-        driving = self.sources[file.torque_source]
-        watched = replace(self._watched, driving=driving, supervising=self._others(driving))
-        faults = detect_faults(self.inputs, watched, file.limits, None, t_ns)
+        found = detect_faults(self.inputs, self._watched, file.limits, None, t_ns)
+        faults = found if is_enabled else self._lasting(found)
         if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
             return reason
         if not confirmed and (drops := self.operator.drop_sentence(file)):
             return f"{drops}; secure it, then confirm it with `shearloop command start --yes`"
-        speeds = Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
-        self.experiment, self._watched = Experiment(file, t_ns, speeds), watched
+        return None
+
+    def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:
+        """Begin an experiment; return None, or why it cannot begin; `confirmed` is as in `refusal_of`."""
+        if (reason := self.refusal_of(file, t_ns, confirmed=confirmed)) is not None:
+            return reason
+        driving, speeds = self.sources[file.torque_source], Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
+        self.experiment = Experiment(file, t_ns, speeds)
+        self._watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         self.stated_tool_mm = file.tool_mm
         self.wrist = self._wrists[file.torque_source]
         # What the last experiment knew of the tool may be wrong by now.
@@ -385,6 +394,10 @@ class ControlLoop:
         arm = self.inputs.arm
         enabled = arm is not None and arm.enabled_by_start
         return [fault for fault in faults if not (enabled and fault.code is FaultCode.ROBOT_BLOCKED)]
+
+    def _lasting(self, faults: Sequence[Fault]) -> list[Fault]:
+        """Return the faults that a start meets once the arm is enabled: a pause of the loop is over by then."""
+        return [fault for fault in self._unless_enabled_by_start(faults) if not fault.rule.is_past]
 
     def _awaited_judgement(self) -> str | None:
         """Return why the gripper cannot yet say whether it has an earlier daemon's grip, or None."""

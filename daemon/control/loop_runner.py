@@ -214,16 +214,18 @@ class ControlLoopRunner:
         if self._closed:
             return ENDING
         stops_before = self._stop_count if stops_before is None else stops_before
-        refusal = None
-        # The control loop refuses while an experiment runs or a stop waits for the operator; a stopped arm must not be
-        # enabled on the way.
-        if self._stop_count == stops_before and self._control_loop.operator.start_refusal() is None:
+        # An arm is not enabled for an experiment that cannot begin. What refuses it may also come until it is enabled.
+        refusal = (
+            self.busy()
+            or self._taring()
+            or self._control_loop.refusal_of(file, self._clock.now_ns(), confirmed=confirmed, is_enabled=False)
+        )
+        if self._stop_count == stops_before and refusal is None:
             refusal = await self._enable() or deadline.why_passed("enabling the arm")
         if self._stop_count != stops_before:
             if not self._closed:
                 self._control_loop.stop(Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
             return STOPPED_AT_START
-        # The first step could grip a tool, and the tool's torque would become the zero.
         if (refusal := refusal or self.busy() or self._taring()) is not None:
             return refusal
         now_ns = self._clock.now_ns()

@@ -9,13 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.loop_runner import ControlLoopRunner
+from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.messages import LoopStop
-from shearloop.daemon.torques import WRENCH
+from shearloop.daemon.torques import WRENCH, TorqueSample
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
 from shearloop.drivers.ur.poses import along_tool
@@ -250,6 +253,46 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         file = experiment(MOVE)
         assert "is running; stop it first" in (await cell.runner.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
+
+
+REFUSED_ONLY_BY_THE_EXPERIMENT = {
+    "a tool would drop": ([{"do": "release"}], {}, "secure it, then confirm it"),
+    "a move with a held tool": ([MOVE], {}, "put a `grip` or a `release` before step 1"),
+    "a torque beyond its limit": ([TWIST], {"limits": {"torque_nm": 0.05}}, "measured"),
+}
+
+
+@pytest.mark.parametrize("why", REFUSED_ONLY_BY_THE_EXPERIMENT)
+async def test_an_arm_is_not_enabled_for_an_experiment_that_cannot_begin(why):
+    steps, keys, said = REFUSED_ONLY_BY_THE_EXPERIMENT[why]
+    loop = ControlLoop(LoopConfig(), {WRENCH: wrench_source(SETTINGS.rate_hz)}, ("robot", "gripper"))
+    async with driven(cell=Cell(loop)) as cell:
+        now_ns = cell.robot.bench.now_ns
+        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.1, "", now_ns, now_ns))
+        assert cell.state.awaits_enable
+        starting = asyncio.create_task(cell.runner.start(experiment(*steps, **keys)))
+        while not starting.done():
+            await cell.cycles(1)
+        assert said in starting.result()
+        assert cell.robot.commands == []
+        assert cell.state.awaits_enable
+
+
+async def test_what_refuses_a_start_while_the_arm_is_enabled_begins_nothing():
+    loop = ControlLoop(LoopConfig(), {WRENCH: wrench_source(SETTINGS.rate_hz)}, ("robot", "gripper"))
+    async with driven(cell=Cell(loop)) as cell:
+        cell.holding = False
+        await cell.cycles(5)
+        starting = asyncio.create_task(cell.runner.start(experiment({"do": "release"})))
+        while not cell.robot.commands:
+            await cell.cycles(1)
+        assert not starting.done()
+        # Somebody puts a tool between the fingers.
+        cell.holding = True
+        while not starting.done():
+            await cell.cycles(1)
+        assert "secure it, then confirm it" in starting.result()
+        assert cell.control_loop.experiment is None
 
 
 @pytest.mark.parametrize("running", [False, True])

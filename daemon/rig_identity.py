@@ -14,6 +14,7 @@ from typing import Any, Final
 from shearloop.daemon.commissioning_report import RigIdentity
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.sensing.sessions import COMBINED
+from shearloop.daemon.torques import LOAD_CELL, WRENCH
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.script import own_script_hash
@@ -87,16 +88,18 @@ def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:
     return {name: own for name, own in hashes.items() if stage[0] in _JUDGED_BY[name]}
 
 
-def source_sha256(config: DaemonConfig, source: str) -> str:
+def source_sha256(config: DaemonConfig, source: str) -> str | None:
     """Return the hash of the settings and the calibration behind a source's torques, of a fingertip or of several.
 
-    For the load cell and the wrench it is the hash of no file: their settings belong to the stages of a commissioning.
-    Raises UserError where the calibration cannot be read.
+    It is empty for the load cell and the wrench, whose settings belong to the stages of a commissioning, and None for a
+    source that no stage compares with the load cell. Raises UserError where the calibration cannot be read.
     """
+    if source in (LOAD_CELL, WRENCH):
+        return ""
     real = config.real
     settings = real.model_dump(mode="json", include=_TORQUE_KEYS)
     estimated = {**real.fingertips, COMBINED: real.combined}.get(source)
-    return _sha256_of([settings, _sha256_of_file(estimated.calibration)]) if estimated is not None else ""
+    return _sha256_of([settings, _sha256_of_file(estimated.calibration)]) if estimated is not None else None
 
 
 def _settings_of(config: DaemonConfig) -> tuple[dict[str, Any], dict[str, Any]]:

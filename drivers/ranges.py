@@ -14,6 +14,7 @@ def _range(unit: str, *, le: float, ge: float | None = None, gt: float | None = 
 
 # A full turn and a digit more, so that 6.2832 is one: UR joints turn by ± 360°.
 LARGEST_ANGLE_RAD = 6.2832
+LARGEST_MARGIN_RAD = 1.0
 # ur-rtde refuses a faster command, which would end the worker (rtde_control_interface.h: UR_JOINT_VELOCITY_MAX and its
 # neighbours). A stop brakes up to the hard limit of acceleration.
 LARGEST_WRIST_SPEED_RAD_PER_S, _LARGEST_ANGULAR_ACCELERATION, _LARGEST_SPEED_M_PER_S = 3.14, 40.0, 3.0
@@ -22,7 +23,7 @@ LARGEST_TORQUE_NM = 5.0
 
 Angle = Annotated[float, _range("rad", ge=-LARGEST_ANGLE_RAD, le=LARGEST_ANGLE_RAD)]
 Turn = Annotated[float, _range("rad", gt=0, le=LARGEST_ANGLE_RAD)]
-AngleMargin = Annotated[float, _range("rad", gt=0, le=1)]
+AngleMargin = Annotated[float, _range("rad", gt=0, le=LARGEST_MARGIN_RAD)]
 # The largest UR arm reaches 1.75 m.
 Coordinate = Annotated[float, _range("m", ge=-2, le=2)]
 CoordinateMargin = Annotated[float, _range("m", gt=0, le=0.5)]

@@ -33,6 +33,8 @@ _SHORTEST_HANG_S = 0.3
 _SHORTEST_RECOVERY_S = 10.0
 # A controller takes a command in its next cycle, which takes 8 ms on a CB3, 2 ms on an e-Series.
 _SHORTEST_REACTION_S = 0.002
+# Slower than any arm: such a delay was written in another unit.
+LONGEST_REACTION_S = 0.5
 # The speeds of an arm at rest reach 0.003 rad/s by noise. With a lower threshold an arm is never at rest.
 MIN_REST_RAD_PER_S = 0.002
 # The largest age of a state with which a robot on another computer may move.
@@ -49,6 +51,7 @@ _SHORTEST_LEASE = 0.3
 _WATCHDOG_FACTOR = 1.5
 # Speeds of up to 0.003 rad/s were reported from arms that stand.
 REST_RAD_PER_S = 0.01
+RestSpeed = Annotated[float, Field(ge=MIN_REST_RAD_PER_S, le=0.05)]
 
 
 Generation = Literal["e-series", "cb3"]
@@ -336,9 +339,9 @@ class UrSettings(_Checked):
     """A longer cycle is a hang and ends the worker, because calls of ur-rtde block for up to 301 s."""
     recover_timeout_s: Annotated[float, Field(ge=_SHORTEST_RECOVERY_S, le=300)] = 30.0
     """Time for each step of making the robot ready: power, brakes, control program."""
-    reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=0.5)] = 0.04
+    reaction_s: Annotated[float, Field(ge=_SHORTEST_REACTION_S, le=LONGEST_REACTION_S)] = 0.04
     """Delay until a commanded speed takes effect; distances to the joint limits include it."""
-    rest_rad_per_s: Annotated[float, Field(ge=MIN_REST_RAD_PER_S, le=0.05)] = REST_RAD_PER_S
+    rest_rad_per_s: RestSpeed = REST_RAD_PER_S
     """A joint slower than this is at rest."""
 
     def __post_init__(self) -> None:

@@ -17,7 +17,7 @@ from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperiment
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S, measured_widths
 from shearloop.daemon.report_in_use import commissioning_of
-from shearloop.daemon.report_validity import MAX_AGE_DAYS
+from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
 from shearloop.drivers.ur.client import UrRobot
@@ -144,6 +144,33 @@ def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, chan
     assert why in found.cap.why
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
     assert found.supplied == NOTHING_SUPPLIED
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("torque_nm", 50.0),
+        ("torque_nm", float("inf")),
+        ("torque_nm", -1.0),
+        ("wrist_speed_rad_per_s", -0.1),
+        ("rest_rad_per_s", 0.5),
+        ("rest_rad_per_s", float("nan")),
+        ("actuation_s", -0.01),
+        ("reaction_s", 40.0),
+        ("stop_rad", float("inf")),
+        ("widths", [[70.0, 1000.0], [198.0, 20.0]]),
+        ("widths", [[70.0, float("nan")], [198.0, 20.0]]),
+        ("torque_sources", {"right": "a hash"}),
+    ],
+)
+def test_a_report_with_a_value_that_no_stage_measures_is_refused(tmp_path, key, value):
+    path = tmp_path / "report.yaml"
+    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    written = yaml.safe_load(path.read_text())
+    written["stages"][0]["supplies"][key] = value
+    path.write_text(yaml.safe_dump(written))
+    with pytest.raises(UserError, match=key):
+        load_report(path)
 
 
 NEW = "run `shearloop commission CONFIG --out NEW_FILE`, then write `commissioned: NEW_FILE` into the configuration"
@@ -354,6 +381,12 @@ def test_the_raised_torque_is_of_the_sources_that_stage_7_measured(tmp_path):
     }
     assert torques == {"load_cell": 0.4, "right": 0.4, "wrench": 0.4, "skin": 0.3, "left": 0.3, "combined": 0.3}
     assert "0.4 N·m (load_cell, right, wrench; any other source 0.3 N·m)" in found.sentence
+
+
+def test_a_source_that_no_stage_compares_raises_nothing_whatever_the_report_says(tmp_path):
+    of_nothing = SUPPLIED.model_copy(update={"torque_sources": {"skin": "", "left": "", "wrench": ""}})
+    cap = commissioned(tmp_path, report_of(write_rig(tmp_path), "013457", of_nothing)).cap
+    assert cap.torque_sources == ("load_cell", "wrench")
 
 
 def test_another_calibration_of_a_fingertip_lowers_its_torque_alone(tmp_path):

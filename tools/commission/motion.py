@@ -14,7 +14,7 @@ from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.observer import WRIST, Seen
 from shearloop.tools.commission.operator import Played
-from shearloop.tools.commission.report import Measured, judged, percentile_99
+from shearloop.tools.commission.report import Measured, has_failed, judged, percentile_99
 
 STAGE: Final = "3 empty gripper"
 SPEED_RAD_PER_S: Final = 0.2
@@ -88,11 +88,12 @@ def measure(context: Context) -> Measured:
         context.comes_to_rest(_COMES_TO_REST_S)
         turns.append(Turn(sent["t_ns"], sign * speed, context.observer.since(sent["t_ns"])))
         context.observer.forget()
-    lines, supplies = judge_turns(turns, context, SIGMAS * sigma_rad_per_s)
+    lines, delays_s = judge_turns(turns, context, SIGMAS * sigma_rad_per_s)
+    lines = [noise_line, *lines, _slider(context)]
+    if has_failed(lines):
+        return Measured(lines)
     rest_rad_per_s = max(MIN_REST_RAD_PER_S, round(SIGMAS * sigma_rad_per_s, 4))
-    return Measured(
-        [noise_line, *lines, _slider(context)], supplies.model_copy(update={"rest_rad_per_s": rest_rad_per_s})
-    )
+    return Measured(lines, Supplied.model_validate({"rest_rad_per_s": rest_rad_per_s, **delays_s}))
 
 
 def judge_noise(samples: Sequence[Seen], rest_rad_per_s: float) -> tuple[Line, float]:
@@ -109,8 +110,11 @@ def judge_noise(samples: Sequence[Seen], rest_rad_per_s: float) -> tuple[Line, f
     return line, sigma
 
 
-def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float) -> tuple[list[Line], Supplied]:
-    """Return the lines on delay, tracking and acceleration, and the delays."""
+def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float) -> tuple[list[Line], dict[str, float]]:
+    """Return the lines on delay, tracking and acceleration, and the delays by their names in `Supplied`.
+
+    There are no delays where the computer is later than `reaction_s`, which only an emulated rig may be.
+    """
     settings, longest_s = context.settings, context.limits.reaction_s(context.settings)
     # The ramp takes some milliseconds to a speed that noise does not have.
     threshold = max(noise_rad_per_s, 0.02 * SPEED_RAD_PER_S)
@@ -156,8 +160,9 @@ def judge_turns(turns: Sequence[Turn], context: Context, noise_rad_per_s: float)
             count=len(turns),
         ),
     ]
-    supplied = Supplied(actuation_s=round(statistics.median(delays_s), 4), reaction_s=round(p99_s, 4))
-    return lines, supplied if p99_s <= settings.reaction_s else Supplied()
+    if p99_s > settings.reaction_s:
+        return lines, {}
+    return lines, {"actuation_s": round(statistics.median(delays_s), 4), "reaction_s": round(p99_s, 4)}
 
 
 def _slider(context: Context) -> Line:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning_report import Report, StageResult
+from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Report, StageResult
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.motion_cap import why_not_emulated
 from shearloop.daemon.report_validity import old_stages
@@ -25,6 +25,7 @@ from shearloop.tools.commission.remembered import LeftRobot
 from shearloop.tools.commission.report import (
     Measured,
     earlier_report,
+    has_failed,
     page_path,
     report_for,
     save_report,
@@ -144,7 +145,7 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
             operator=name,
             date=datetime.now(UTC),
             lines=tuple(measured.lines),
-            supplies=measured.supplies,
+            supplies=NOTHING_SUPPLIED if has_failed(measured.lines) else measured.supplies,
             judged_sha256s=judged_by(stage, judged_sha256s(context.config)),
         )
         context.report = with_stage(context.report, result)

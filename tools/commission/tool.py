@@ -98,7 +98,8 @@ def measure(context: Context) -> Measured:
     if has_failed(lines):
         return Measured(lines)
     lines.append(raised_line(largest_nm, right))
-    sources = {name: source_sha256(context.config, name) for name in right}
+    hashes = {name: source_sha256(context.config, name) for name in right}
+    sources = {name: own for name, own in hashes.items() if own is not None}
     return Measured(lines, Supplied(torque_nm=largest_nm, torque_sources=sources))
 
 

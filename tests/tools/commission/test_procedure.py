@@ -14,6 +14,7 @@ from shearloop.bank.bank_file import Bank
 from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Line
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.report_in_use import commissioning_of
+from shearloop.daemon.report_validity import load_report
 from shearloop.daemon.rig import open_settings
 from shearloop.tools.commission import stops
 from shearloop.tools.commission.bounds import LARGEST_RAD
@@ -201,6 +202,8 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     report, _ = lab.run("" if stage <= "4" else stage)
     assert failed(report) == [line]
     assert report.stages[-1].stage.startswith(stage)
+    assert report.stages[-1].supplies == NOTHING_SUPPLIED, "what failed is no measurement"
+    assert load_report(lab.path.with_name("report.yaml")) == report
 
 
 @pytest.fixture

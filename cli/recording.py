@@ -184,6 +184,11 @@ def _other_keys(found: "RecordingSummary") -> list[str]:
     for name, topic in found.topics.items():
         if topic.not_recorded:
             lines.append(f"  {name} was recorded without {', '.join(topic.not_recorded)}: exports have no value there.")
+        if topic.differing:
+            recorded = ", ".join(f"{key} {how}" for key, how in topic.differing.items())
+            lines.append(f"  {name} was recorded with {recorded}: tables have it so, and nothing computes with it.")
+        if not topic.known:
+            lines.append(f"  {name} is a topic that this version does not have: csv, parquet, mat and rrd have it.")
         if topic.unknown:
             lines.append(f"  {name} was recorded with {', '.join(topic.unknown)}, which this version does not have.")
         if topic.problem:

@@ -69,7 +69,9 @@ def run(args: argparse.Namespace) -> int:
             "dropped_at_opening": comparison.dropped_at_opening,
             "same_code": same_code,
             "not_recorded": run.not_recorded,
+            "differing": run.differing,
             "left_out": run.left_out,
+            "left_out_topics": run.unknown_topics,
         }
         print_result(counts | others, (), as_json=True)
     return 1 if args.check and not comparison.passed else 0
@@ -127,8 +129,14 @@ def _other_keys_text(run: "RecordedRun", made_by: str) -> list[str]:
 
     other = f"Other code (shearloop {made_by}) made the recording"
     lines = [f"{other} without {named(run.not_recorded)}: no value is sent there."] if run.not_recorded else []
+    for topic, keys in run.differing.items():
+        recorded = ", ".join(f"{key} {how}" for key, how in keys.items())
+        lines.append(f"{other} with {recorded}, of {topic}: no value is sent there.")
     if run.left_out:
         lines.append(f"{other} with {named(run.left_out)}: this version does not have that, and leaves it out.")
+    if run.unknown_topics:
+        topics = ", ".join(run.unknown_topics)
+        lines.append(f"{other} with the topics {topics}: this version does not have them, and leaves them out.")
     return lines
 
 

@@ -96,7 +96,7 @@ def _struct_names(topics: Iterable[str]) -> dict[str, str]:
     """Return a name of MATLAB for each topic, and number those that would be alike: `eit.frame.a-b` and `….a_b`."""
     names: dict[str, str] = {}
     for topic in topics:
-        # Each has a dot, or is `health`: none is the variable of the units.
+        # No topic is named like the variable of the units.
         plain = re.sub(r"\W", "_", topic, flags=re.ASCII)[:_LONGEST_NAME]
         number, name = 1, plain
         while name in names.values():

@@ -30,7 +30,7 @@ from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.message_content import check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
-from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns
+from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, own_name
 
 ROWS_PER_S = 25
 _PERIOD_NS = 10**9 // ROWS_PER_S
@@ -78,9 +78,9 @@ class _Held:
         self.names = [f"channel_{i}" for i in range(table.n_channels)] if self._table else []
         for key in self._keys:
             self.names += [f"{key}_{i}" for i in range(_VECTOR)] if key in _VECTORS else [key]
-        # By the keys of the message.
-        known = columns.units
-        self.units = {key: known[key] for key in (self._keys or ["channels"]) if key in known}
+        # By the keys of the message; those of another unit have no value.
+        own = columns.own
+        self.units = {key: own[key].unit for key in (self._keys or ["channels"]) if own[key].unit}
         self._columns = columns
         values = [0.0 if name == "valid" else np.nan for name in self.names]
         self.vector: NDArray[np.float32] = np.array(values, dtype=np.float32)
@@ -158,7 +158,7 @@ def export_lerobot(path: Path, out: Path, topics: list[str], progress: Progress 
     require("pyarrow", "export", "a LeRobot dataset")
     with open_recording(path) as recording:
         attachments = recording.attachments()
-        used = [topic for topic in topics if schema.schema_name(topic) in _FEATURES]
+        used = [topic for topic in topics if own_name(topic) in _FEATURES]
         held = {topic: _Held(topic, recording.columns(topic), recording.table) for topic in used}
         try:
             configuration = json.loads(attachments.pop(schema.CONFIGURATION, b"null"))

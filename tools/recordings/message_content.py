@@ -30,11 +30,11 @@ def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -
 
     `columns` describe the topic in its file; the default is this version's. A value that is missing, or whose key the
     file's schema lacks, is None. Numbers are floats, arrays are lists of floats, integers or None. An imported message
-    has only the keys that its import writes. Raises UnknownTopicError for another topic and ContentError for what does
-    not fit it.
+    has only the keys that its import writes. Raises ContentError for what does not fit the topic, and without columns
+    UnknownTopicError for one that this version does not have.
     """
-    name = schema.schema_name(topic)
-    columns = columns or own_topic(name)
+    columns = columns or own_topic(schema.schema_name(topic))
+    name = columns.name
     if len(data) > _LARGEST_MESSAGE_BYTES:
         raise ContentError(f"it has {len(data) >> 20} MB, and at most {_LARGEST_MESSAGE_BYTES >> 20} are read")
     try:
@@ -44,8 +44,9 @@ def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -
         raise ContentError(f"it is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise ContentError(f"it is {_quoted(content)}, not a map")
-    imported = name in schema.IMPORTED_KEYS and not content.keys() & _LIVE_KEYS
-    expected = [*schema.IMPORTED_KEYS[name], *columns.unknown] if imported else list(columns.all)
+    imported, expected = False, list(columns.all)
+    if name is not None and name in schema.IMPORTED_KEYS and not content.keys() & _LIVE_KEYS:
+        imported, expected = True, [*schema.IMPORTED_KEYS[name], *columns.unknown]
     allowed = columns.recorded.keys() & {*expected}
     if other := [key for key in content if key not in allowed]:
         raise ContentError(f"it has the unknown key {_quoted(other[0])}")
@@ -60,7 +61,7 @@ def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -
     return row
 
 
-def _check_known(name: str, row: Mapping[str, Any]) -> None:
+def _check_known(name: str | None, row: Mapping[str, Any]) -> None:
     """Raise ContentError for values that no daemon writes, among those that this version knows."""
     for key in ("t_mono_ns", "offset_ns", schema.ARRIVAL):
         check_time(key, row.get(key) or 0)

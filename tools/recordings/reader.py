@@ -109,19 +109,20 @@ class OpenRecording:
         return ((channel, message) for _, channel, message in messages)
 
     def columns(self, topic: str) -> TopicColumns:
-        """Return the columns of a topic by its schema in the file; raises ContentError and UnknownTopicError."""
+        """Return the columns of a topic by its schema in the file; raises SchemaError."""
         if topic not in self._columns:
-            first, *others = self._schemas.get(topic, [None])
-            if others and any((one and one.data) != (first and first.data) for one in others):
+            schemas = self._schemas.get(topic, [None])
+            texts = {one.data if one else None for one in schemas}
+            if len(texts) > 1:
                 raise SchemaError(f"{topic}: it has several schemas")
             try:
-                self._columns[topic] = recorded_topic(schema.schema_name(topic), first)
+                self._columns[topic] = recorded_topic(topic, schemas[0])
             except SchemaError as error:
                 raise SchemaError(f"{topic}: {error}") from error
         return self._columns[topic]
 
     def content(self, channel: Channel, message: Message) -> dict[str, Any]:
-        """Return a message's content by the names of its topic; raises ContentError and UnknownTopicError."""
+        """Return a message's content by the names of its topic; raises ContentError."""
         columns = self.columns(channel.topic)
         try:
             content = read_content(channel.topic, message.data, columns)
@@ -132,7 +133,7 @@ class OpenRecording:
                 raise ContentError("it has other keys than the first one")
             if "timestamp" in content and not has_one_offset(self.identity):
                 known = columns.known(content)
-                times = schema.unix_times(schema.schema_name(channel.topic), known, message.log_time)
+                times = schema.unix_times(columns.name or channel.topic, known, message.log_time)
                 content |= {key: time for key, time in times.items() if known[key] is not None}
                 if known.get(schema.ARRIVAL) is not None:
                     check_time(schema.ARRIVAL, content[schema.ARRIVAL])
@@ -178,16 +179,8 @@ def open_recording(path: Path) -> Iterator[OpenRecording]:
         wrote = f"version {recording.identity.get('software', 'unknown')} wrote this recording"
         try:
             yield recording
-        except schema.UnknownTopicError as error:
-            cure = "read it with that version, or export other topics"
-            raise UserError(
-                f"{path}: shearloop {schema.software_version()} has no topic {str(error)!r}; {wrote}: {cure}"
-            ) from error
         except MissingKeyError as error:
-            cure = "it can be exported as csv, parquet or mat"
-            raise UserError(
-                f"{path}: {error}, which the recording does not have; {wrote} without it; {cure}"
-            ) from error
+            raise UserError(f"{path}: {error}; {wrote}; it can be exported as csv, parquet or mat") from error
         except SchemaError as error:
             raise UserError(f"{path}: a schema cannot be used: {error}; {_OTHER_PROGRAM}") from error
         except ContentError as error:

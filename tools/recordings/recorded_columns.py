@@ -1,7 +1,9 @@
 """The columns of a recorded topic: the keys of the schema in its own file, next to the keys of this version.
 
 A recording holds the schema that its writer used, so a message is read by the schema of its file. A key of this version
-that the file's schema lacks has no value. A key that only the file's schema has keeps its name and its type.
+that the file's schema lacks has no value. A key that only the file's schema has keeps its name, its type and its unit.
+So does each key of a topic that this version does not have. A key with another type or unit than this version's is
+exported as it was recorded, and nothing computes with it.
 """
 
 import re
@@ -13,7 +15,7 @@ from typing import Any, NamedTuple
 from mcap.records import Schema
 from pydantic_core import from_json
 
-from shearloop.daemon.messaging.messages import units
+from shearloop.daemon.messaging.messages import ENVELOPE, units
 from shearloop.daemon.recorder import schema
 
 # The JSON types of the keys of a message.
@@ -24,9 +26,22 @@ _LARGEST_SCHEMA_BYTES = 256 << 10
 _MOST_KEYS = 1000
 # Keys become names of columns in files, also in MATLAB's.
 _KEY = re.compile(r"[a-z][a-z0-9_]{0,58}", re.ASCII)
+# Topics that this version does not have become names too, of files and of MATLAB's variables.
+_TOPIC = re.compile(r"[a-z][a-z0-9_]{0,30}(\.[A-Za-z0-9_-]{1,60}){0,3}", re.ASCII)
+# The table of the units in an export.
+_NO_TOPIC = "units"
 _LOG_TIME = "log_time_ns"
 _LONGEST_UNIT = 20
-_TIMES = dict.fromkeys((_LOG_TIME, "t_mono_ns", "offset_ns", schema.ARRIVAL, schema.SUSPENDED), "ns")
+# Earlier schemas have the unit only here.
+_UNIT_IN_DESCRIPTION = re.compile(rf"\(([^()]{{1,{_LONGEST_UNIT}}})\)$")
+# The times whose unit no schema has.
+_TIMES = {
+    **dict.fromkeys((_LOG_TIME, "t_mono_ns", "offset_ns", schema.ARRIVAL, schema.SUSPENDED), "ns"),
+    "timestamp": "s",
+}
+# The bank's model decides between the units of these; earlier versions declared one, or both.
+_UNITS_OF_K = frozenset({"", "cm", "cm or rad/cm"})
+_KEYS_OF_K = frozenset({"k", "k_low", "k_high"})
 
 
 class ContentError(ValueError):
@@ -50,7 +65,9 @@ class Column(NamedTuple):
 class TopicColumns:
     """The columns of one topic of a recording, by their names."""
 
-    # Those of this version, in the order of its schema.
+    # The name of its schema in this version, None for a topic that this version does not have.
+    name: str | None
+    # Those of this version, in the order of its schema; of a topic that it does not have, the envelope's.
     own: Mapping[str, Column]
     # Those of the file's schema, in its order.
     recorded: Mapping[str, Column]
@@ -66,15 +83,26 @@ class TopicColumns:
         return {_LOG_TIME: _TIMES[_LOG_TIME], **{key: one.unit for key, one in self.all.items() if one.unit}}
 
     @cached_property
+    def differing(self) -> Mapping[str, str]:
+        """The keys that were recorded with another type or unit than this version's, and how: `in mN·m, not in N·m`."""
+        shared = (key for key in self.own if key in self.recorded)
+        found = {key: _difference(self.recorded[key], self.own[key]) for key in shared}
+        return {key: difference for key, difference in found.items() if difference}
+
+    @cached_property
     def usable(self) -> frozenset[str]:
-        """The keys of this version that were recorded with its types."""
-        shared = self.own.keys() & self.recorded.keys()
-        return frozenset(key for key in shared if _is_of_kind(self.recorded[key].kind, self.own[key].kind))
+        """The keys of this version that were recorded with its types and units."""
+        return frozenset((self.own.keys() & self.recorded.keys()) - self.differing.keys())
+
+    @cached_property
+    def unusable(self) -> list[str]:
+        """The keys of this version without a recorded value of its type and unit."""
+        return [key for key in self.own if key not in self.usable]
 
     @cached_property
     def not_recorded(self) -> list[str]:
-        """The keys of this version without a recorded value of its type."""
-        return [key for key in self.own if key not in self.usable]
+        """The keys of this version that were not recorded, with any type or unit."""
+        return [key for key in self.own if key not in self.recorded]
 
     @cached_property
     def unknown(self) -> list[str]:
@@ -82,18 +110,19 @@ class TopicColumns:
         return [key for key in self.recorded if key not in self.own]
 
     def known(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the part of a row that this version knows; None for a value that was not recorded with its type."""
+        """Return the part of a row that this version knows; None for a value without its type and unit."""
         return {key: value if key in self.usable else None for key, value in row.items() if key in self.own}
 
     def need(self, topic: str, keys: Iterable[str], user: str) -> None:
-        """Raise MissingKeyError if `user`, a command, needs a key that was not recorded."""
+        """Raise MissingKeyError if `user`, a command, needs a key that was not recorded with its type and unit."""
         for key in keys:
             if key not in self.usable:
-                raise MissingKeyError(f"{user} needs the key {key!r} of {topic}")
+                how = f"was recorded {self.differing[key]}" if key in self.differing else "the recording does not have"
+                raise MissingKeyError(f"{user} needs the key {key!r} of {topic}, which {how}")
 
 
 class MissingKeyError(Exception):
-    """A recording lacks a key that a command computes with."""
+    """A recording lacks a key that a command computes with, or has it with another type or unit."""
 
 
 @cache
@@ -105,28 +134,52 @@ def own_columns(name: str) -> Mapping[str, Column]:
     return {key: Column(key, definition["type"], key in optional, known.get(key, "")) for key, definition in described}
 
 
+def own_name(topic: str) -> str | None:
+    """Return the name of a recorded topic's schema, None for a topic that this version does not have."""
+    try:
+        return schema.schema_name(topic)
+    except schema.UnknownTopicError:
+        return None
+
+
 @cache
 def own_topic(name: str) -> TopicColumns:
     """Return the columns of a topic whose file has the schema of this version, or none."""
-    return TopicColumns(own_columns(name), own_columns(name))
+    return TopicColumns(name, own_columns(name), own_columns(name))
 
 
-def recorded_topic(name: str, written: Schema | None) -> TopicColumns:
-    """Return the columns of a topic by the schema in its file, None for a file without schemas.
+def recorded_topic(topic: str, written: Schema | None) -> TopicColumns:
+    """Return the columns of a recorded topic by the schema in its file, None for a topic without one.
 
-    Raises SchemaError for a schema that no version writes.
+    Raises SchemaError for a schema that no version writes, and for a topic that only a schema would describe.
     """
+    name = own_name(topic)
+    if name is None and (not _TOPIC.fullmatch(topic) or topic == _NO_TOPIC):
+        raise SchemaError(f"no version has a topic {topic[:40]!r}")
     if written is None:
+        if name is None:
+            raise SchemaError("this version does not have this topic, and the recording has no schema of it")
         return own_topic(name)
-    own = own_columns(name)
     properties, required = _described(written)
+    own = _envelope(properties) if name is None else own_columns(name)
     # The required keys of these topics are an import's, and a live message has others too.
     imported = name in schema.IMPORTED_KEYS
     recorded = {}
     for key, definition in properties.items():
-        optional = (own[key].optional if key in own else True) if imported else key not in required
-        recorded[key] = _column(key, definition, own.get(key), optional=optional)
-    return TopicColumns(own, recorded)
+        if not imported:
+            optional = key not in required
+        elif key in own:
+            optional = own[key].optional
+        else:
+            optional = True
+        recorded[key] = _column(key, definition, optional=optional)
+    return TopicColumns(name, own, recorded)
+
+
+def _envelope(properties: Iterable[str]) -> Mapping[str, Column]:
+    """Return the columns of the keys that every message has, as far as a schema has them."""
+    every = own_columns(schema.LOAD_TOPIC)
+    return {key: every[key] for key in properties if key in ENVELOPE}
 
 
 def _described(written: Schema) -> tuple[dict[str, Any], list[Any]]:
@@ -153,18 +206,35 @@ def _described(written: Schema) -> tuple[dict[str, Any], list[Any]]:
     return properties, required
 
 
-def _column(key: str, definition: Any, own: Column | None, *, optional: bool) -> Column:
+def _column(key: str, definition: Any, *, optional: bool) -> Column:
     """Return the column of one key of a schema in a file."""
     kind = definition.get("type") if isinstance(definition, dict) else None
     if not _KEY.fullmatch(key) or key == _LOG_TIME:
         raise SchemaError(f"its schema has the key {key[:40]!r}, which is no name of a column")
     if kind not in KINDS:
         raise SchemaError(f"its schema gives {key!r} no type of {', '.join(KINDS)}")
-    unit = definition.get("unit", own.unit if own is not None else "")
+    unit = _unit(key, definition)
     if not isinstance(unit, str) or not unit.isprintable() or len(unit) > _LONGEST_UNIT:
         raise SchemaError(f"its schema gives {key!r} a unit that is no short text")
     return Column(key, kind, optional, unit)
 
 
-def _is_of_kind(recorded: str, own: str) -> bool:
-    return recorded == own or (recorded, own) == ("integer", "number")
+def _unit(key: str, definition: Mapping[str, Any]) -> Any:
+    """Return what a schema in a file gives as the unit of a key, "" for none."""
+    if "unit" in definition:
+        return definition["unit"]
+    in_description = _UNIT_IN_DESCRIPTION.search(str(definition.get("description", "")))
+    return in_description[1] if in_description else _TIMES.get(key, "")
+
+
+def _difference(recorded: Column, own: Column) -> str:
+    """Return in which type or unit a key was recorded, if it is not this version's; else ""."""
+    if recorded.kind != own.kind and (recorded.kind, own.kind) != ("integer", "number"):
+        return f"as {recorded.kind}, not {own.kind}"
+    if recorded.unit == own.unit or (own.name in _KEYS_OF_K and recorded.unit in _UNITS_OF_K):
+        return ""
+    return f"{_in_unit(recorded)}, not {_in_unit(own)}"
+
+
+def _in_unit(column: Column) -> str:
+    return f"in {column.unit}" if column.unit else "without a unit"

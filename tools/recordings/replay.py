@@ -46,7 +46,7 @@ from shearloop.estimation import BeforeFrame, HeldTool, Session
 from shearloop.models import validated
 from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.reader import OpenRecording, open_recording, reading
-from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns
+from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, own_name
 from shearloop.tools.recordings.replayed_skin import ReplayedSkin
 
 # Topics that a replay computes. All others are sent as they were recorded.
@@ -74,8 +74,8 @@ class RecordedEvent:
     content: Mapping[str, Any]
     source: str = ""
     raw: RawEvent | None = None
-    # The keys of the content that its recording does not have.
-    not_recorded: Collection[str] = ()
+    # The keys of the content that its recording does not have with this version's type and unit.
+    without: Collection[str] = ()
 
 
 class ReplayEvents(NamedTuple):
@@ -129,7 +129,12 @@ class RecordedRun:
     def __init__(self, path: Path) -> None:
         self.path = path
         with open_recording(path) as recording:
-            self.counts = recording.counts
+            known = {topic: own_name(topic) is not None for topic in recording.counts}
+            # Of the topics of this version; a replay leaves out the others.
+            self.counts = {topic: count for topic, count in recording.counts.items() if known[topic]}
+            self.unknown_topics = sorted(
+                topic for topic, count in recording.counts.items() if count and not known[topic]
+            )
             self.metadata = recording.identity
             self._attached = recording.attachments()
             continued = recording.metadata.get(schema.CONTINUED_METADATA, {})
@@ -158,6 +163,11 @@ class RecordedRun:
     def not_recorded(self) -> dict[str, list[str]]:
         """By topic, the keys of this version that the recording does not have."""
         return {topic: columns.not_recorded for topic, columns in self._columns.items() if columns.not_recorded}
+
+    @property
+    def differing(self) -> dict[str, Mapping[str, str]]:
+        """By topic, the keys that were recorded with another type or unit than this version's, and how."""
+        return {topic: columns.differing for topic, columns in self._columns.items() if columns.differing}
 
     @property
     def left_out(self) -> dict[str, list[str]]:
@@ -203,14 +213,14 @@ class RecordedRun:
         """Yield the events in recorded order."""
         with open_recording(self.path) as recording:
             # An imported recording has one side after the other, a live one is in order.
-            recorded = recording.messages(by_time=not self.has_inputs)
+            recorded = recording.messages(self._columns, by_time=not self.has_inputs)
             for number, (channel, message) in enumerate(recorded):
                 columns = self._columns[channel.topic]
                 content = columns.known(recording.content(channel, message))
                 if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
                     yield _imported_event(channel.topic, content, message.log_time, number)
                 else:
-                    yield _live_event(channel.topic, content, columns.not_recorded)
+                    yield _live_event(channel.topic, content, columns.unusable)
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
@@ -293,7 +303,7 @@ class ReplayComparison:
             self._add_difference(event, "the replay did not compute it")
             return
         computed = waiting.popleft()
-        compared = (key for key in event.content if key not in NOT_COMPARED and key not in event.not_recorded)
+        compared = (key for key in event.content if key not in NOT_COMPARED and key not in event.without)
         keys = [key for key in compared if computed.get(key) != event.content[key]]
         if keys:
             changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
@@ -497,14 +507,14 @@ class Replay:
             self._publisher.publish(heatmap)
 
 
-def _live_event(topic: str, content: dict[str, Any], not_recorded: Collection[str]) -> RecordedEvent:
+def _live_event(topic: str, content: dict[str, Any], without: Collection[str]) -> RecordedEvent:
     if topic == schema.CLOCK_TOPIC:
         return RecordedEvent(topic, content["t_mono_ns"], content)
     live = schema.schema_name(topic)
     if live == schema.INPUT:
         raw = schema.input_event(content)
         return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(schema.input_topic("")), raw)
-    return RecordedEvent(live, content["t_mono_ns"], content, content["source"], not_recorded=not_recorded)
+    return RecordedEvent(live, content["t_mono_ns"], content, content["source"], without=without)
 
 
 def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:

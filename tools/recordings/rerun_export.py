@@ -97,17 +97,16 @@ class _RerunFile:
 
     def add(self, topic: str, content: Mapping[str, Any], t_ns: int) -> None:
         """Add one message of a recorded topic."""
-        entity, live = self._rr.new_entity_path(topic.split(".")).lstrip("/"), schema.schema_name(topic)
-        columns = self._columns_of[topic]
+        entity, columns = self._rr.new_entity_path(topic.split(".")).lstrip("/"), self._columns_of[topic]
         for key, value in content.items():
             if (isinstance(value, list) and len(value) > _LONGEST_SCALARS) or key in _NOT_SHOWN:
                 continue
             if isinstance(value, bool | int | float | list):
                 self._units.setdefault(f"{entity}/{key}", columns.units.get(key, ""))
                 self._add(f"{entity}/{key}", value, t_ns)
-        self._draw(entity, live, columns.known(content), t_ns)
+        self._draw(entity, columns.name, columns.known(content), t_ns)
 
-    def _draw(self, entity: str, live: str, content: Mapping[str, Any], t_ns: int) -> None:
+    def _draw(self, entity: str, live: str | None, content: Mapping[str, Any], t_ns: int) -> None:
         """Add the image or the pose of a message, if it has what is drawn."""
         if live == EitHeatmap.topic:
             self._models[content["source"]] = content["model"] or ""

@@ -27,7 +27,7 @@ from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.matlab_import import DIAMETER_FOLDER, RAW_FRAME, RAW_HOMOGENEOUS, TORQUE_FOLDER
 from shearloop.tools.recordings.message_content import check_length
 from shearloop.tools.recordings.reader import open_recording, read_messages, refusing_content
-from shearloop.tools.recordings.recorded_columns import ContentError
+from shearloop.tools.recordings.recorded_columns import ContentError, own_name
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5
@@ -68,8 +68,10 @@ def export_slices(
     Returns the files, and how many holds have no slice by the reason. Existing slices stay. Raises OSError for files
     that cannot be written, and UserError for a recording that cannot be read or has no such hold; then no file is new.
     """
+    used = [topic for topic in topics if own_name(topic) in _NEEDED]
     # Only a control loop holds angles; imported recordings have none.
-    used = [topic for topic in topics if schema.schema_name(topic) in _NEEDED] if LoopState.topic in topics else []
+    if LoopState.topic not in topics:
+        used = []
     with open_recording(path) as recording:
         table = recording.table
         for topic in used:

@@ -26,9 +26,13 @@ class TopicSummary:
 
     messages: int = 0
     rate_hz: float | None = None
+    # Whether this version has this topic.
+    known: bool = True
     # The keys of this version that its schema lacks, and the keys that this version lacks.
     not_recorded: list[str] = field(default_factory=list)
     unknown: list[str] = field(default_factory=list)
+    # The keys with another type or unit than this version's, and how they were recorded.
+    differing: dict[str, str] = field(default_factory=dict)
     # Why its messages cannot be read, or empty.
     problem: str = ""
 
@@ -153,12 +157,14 @@ def named_unix_ns(path: Path) -> int | None:
 def _described(topic: str, written: Schema | None) -> tuple[TopicSummary, TopicColumns | None]:
     """Return the summary of a topic without a message yet, and its columns by its schema in the file."""
     try:
-        columns = recorded_topic(schema.schema_name(topic), written)
-    except schema.UnknownTopicError:
-        return TopicSummary(problem="this version does not have this topic"), None
+        columns = recorded_topic(topic, written)
     except ContentError as error:
         return TopicSummary(problem=str(error)), None
-    return TopicSummary(not_recorded=columns.not_recorded, unknown=columns.unknown), columns
+    if columns.name is None:
+        return TopicSummary(known=False), columns
+    return TopicSummary(
+        not_recorded=columns.not_recorded, unknown=columns.unknown, differing=dict(columns.differing)
+    ), columns
 
 
 def _clock_reading(message: Message, columns: TopicColumns | None) -> ClockReading | None:

@@ -52,7 +52,7 @@ class RecordedTopics(Mapping[str, dict[str, NDArray[Any]]]):
         return len(self.counts)
 
     def units(self, topic: str) -> Mapping[str, str]:
-        """Return the unit of each key of a topic that has one; raises UserError for a topic of another version."""
+        """Return the unit of each key of a topic that has one, as it was recorded; raises UserError."""
         return columns_of_topics(self.path, [topic])[topic].units
 
     def frame(self, topic: str) -> "DataFrame":

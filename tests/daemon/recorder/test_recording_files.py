@@ -278,18 +278,6 @@ def test_mistakes_end_in_one_sentence(arguments, message, recording, tmp_path, m
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_a_topic_of_another_version_is_named(tmp_path, mistake, monkeypatch):
-    path = tmp_path / "new.mcap"
-    with monkeypatch.context() as newer:
-        newer.setattr("shearloop.daemon.recorder.schema.schema_name", lambda _: "load.torque")
-        newer.setattr("shearloop.daemon.recorder.schema.software_version", lambda: "99.1")
-        with new_recording(path, "a bench") as writer:
-            writer.add("arm.temperature", 10**18, 10**18, b'{"torque_nm": 0.5}')
-    said = mistake("recording", "export", path)
-    assert "has no topic 'arm.temperature'; version 99.1 wrote this recording" in said
-    assert "KeyError" not in said
-
-
 def test_a_recording_round_trips(recording):
     found = read_recording(recording)
     assert (found.source, found.notes) == ("a bench", {"tool": "driver"})

@@ -7,8 +7,10 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -43,8 +45,14 @@ Row = dict[str, Any]
 Change = Callable[[str, Row], Row]
 
 
-def rewritten(source: Path, out: Path, of_schema: Callable[[str, Row], Row | bytes], of_message: Change) -> Path:
-    """Copy a recording with other schemas and messages, each changed by its name as a live topic."""
+def rewritten(
+    source: Path,
+    out: Path,
+    of_schema: Callable[[str, Row], Row | bytes],
+    of_message: Change = lambda _, row: row,
+    renamed: Mapping[str, str] = MappingProxyType({}),
+) -> Path:
+    """Copy a recording with other schemas, messages and topics, each changed by its name as a live topic."""
     with source.open("rb") as file, out.open("wb") as copy:
         reader, writer = make_reader(file), Writer(copy)
         writer.start("x")
@@ -55,7 +63,8 @@ def rewritten(source: Path, out: Path, of_schema: Callable[[str, Row], Row | byt
                 text = of_schema(name, json.loads(described.data))
                 data = text if isinstance(text, bytes) else json.dumps(text).encode()
                 number = writer.register_schema(name, "jsonschema", data)
-                channels[channel.topic] = writer.register_channel(channel.topic, "json", number)
+                topic = renamed.get(channel.topic, channel.topic)
+                channels[channel.topic] = writer.register_channel(topic, "json", number)
             content = json.dumps(of_message(name, json.loads(message.data))).encode()
             times = message.log_time, content, message.publish_time, message.sequence
             writer.add_message(channels[channel.topic], *times)
@@ -244,6 +253,95 @@ def test_a_message_that_does_not_fit_its_own_schema_is_refused(topic, content, p
     assert f"{path}: a message cannot be used: {topic}, number " in said
 
 
+def with_definition(source: Path, out: Path, topic: str, key: str, changes: Row) -> Path:
+    """Copy a recording whose schema defines one key in another way; a change to None removes the word."""
+
+    def described(name: str, content: Row) -> Row:
+        if name != topic:
+            return content
+        defined = {**content["properties"][key], **changes}
+        defined = {word: value for word, value in defined.items() if value is not None}
+        return {**content, "properties": {**content["properties"], key: defined}}
+
+    return rewritten(source, out, described)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"unit": "mN·m"}, {"unit": None, "description": "the torque (mN·m)"}], ids=["unit", "description"]
+)
+def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(changes, source, config, tmp_path, ran):
+    path = with_definition(source, tmp_path / "x.mcap", "load.torque", "torque_nm", changes)
+    one = Recorded(path, [], replayable=False)
+    out = tmp_path / "out"
+    out.mkdir()
+    check_tables(one, out, ran)
+    check_rerun(one, out, ran)
+    assert shearloop.read(path).units("load.torque")["torque_nm"] == "mN·m"
+    recorded_so = "torque_nm in mN·m, not in N·m"
+    assert f"load.torque was recorded with {recorded_so}: tables have it so" in ran("recording", "info", path).out
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    ran("recording", "export", path, "--format", "lerobot", "--out", out / "lerobot")
+    load = parquet.read_table(out / "lerobot/data/chunk-000/file-000.parquet")["observation.load"].to_pylist()
+    assert np.isnan(np.array(load)[:, 0]).all()
+    with pytest.raises(UserError, match=r"needs the key 'torque_nm' of load.torque, which was recorded in mN·m, not"):
+        read_recording(path)
+    sent, _ = asyncio.run(replayed(path, math.inf, load_daemon_config(config())))
+    assert {content["torque_nm"] for topic, content in sent if topic == "load.torque"} == {None}
+    said = ran("recording", "replay", path, "--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max")
+    assert f"with {recorded_so}, of load.torque: no value is sent there" in said.err
+
+
+def test_another_unit_of_a_needed_key_refuses_slices_and_replay(source, tmp_path, mistake):
+    sweep = Sweep(tmp_path)
+    sweep.hold(1, 0.1)
+    sweep.export(tmp_path / "first")
+    changed = with_definition(sweep.path, tmp_path / "x.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
+    said = mistake("recording", "export", changed, "--format", "slices", "--out", tmp_path / "none")
+    assert "slices needs the key 'torque_nm' of load.torque, which was recorded in mN·m, not in N·m" in said
+    changed = with_definition(source, tmp_path / "y.mcap", "eit.frame", "age_s", {"unit": "ms"})
+    with pytest.raises(UserError, match=r"a replay needs the key 'age_s' of eit.frame.right, which was recorded in ms"):
+        RecordedRun(changed)
+
+
+def test_schemas_with_units_in_their_descriptions_alone_differ_in_nothing(source, tmp_path):
+    def described(_: str, content: Row) -> Row:
+        properties = {
+            key: {word: value for word, value in one.items() if word != "unit"}
+            for key, one in content["properties"].items()
+        }
+        return {**content, "properties": properties}
+
+    path = rewritten(source, tmp_path / "x.mcap", described)
+    assert not any(topic.differing for topic in summarise(path).topics.values())
+    older, newer = shearloop.read(path), shearloop.read(source)
+    assert {topic: older.units(topic) for topic in older} == {topic: newer.units(topic) for topic in newer}
+    read_recording(path)
+    RecordedRun(path)
+
+
+@pytest.mark.parametrize("unit", ["cm", "cm or rad/cm", ""])
+def test_the_bank_decides_the_unit_of_k_whatever_a_schema_says(unit, source, tmp_path):
+    path = with_definition(source, tmp_path / "x.mcap", "eit.estimate", "k", {"unit": unit})
+    assert not summarise(path).topics["eit.estimate.right"].differing
+    assert shearloop.read(path).units("eit.estimate.right").get("k", "") == unit
+
+
+def test_a_topic_that_this_version_does_not_have_is_exported_as_it_was_recorded(source, config, tmp_path, ran, mistake):
+    path = rewritten(
+        source, tmp_path / "x.mcap", lambda _, described: described, renamed={"gripper.state": "hand.posture"}
+    )
+    one = Recorded(path, [], replayable=False)
+    out = tmp_path / "out"
+    out.mkdir()
+    check_tables(one, out, ran)
+    check_rerun(one, out, ran)
+    check_lerobot(one, out, ran, mistake)
+    assert shearloop.read(path).units("hand.posture") == shearloop.read(source).units("gripper.state")
+    assert "hand.posture is a topic that this version does not have" in ran("recording", "info", path).out
+    said = ran("recording", "replay", path, "--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max")
+    assert "made the recording with the topics hand.posture: this version does not have them" in said.err
+
+
 NUMBER = {"type": "number"}
 HOSTILE: list[Any] = [
     b"",
@@ -277,9 +375,7 @@ def test_a_schema_that_no_version_writes_ends_in_one_sentence(form, text, source
     if form in ("parquet", "lerobot"):
         pytest.importorskip("pyarrow")
     described = text if isinstance(text, bytes) else {"type": "object", **text}
-    path = rewritten(
-        source, tmp_path / "x.mcap", lambda name, own: described if name == "load.torque" else own, lambda _, row: row
-    )
+    path = rewritten(source, tmp_path / "x.mcap", lambda name, own: described if name == "load.torque" else own)
     arguments: tuple[Any, ...] = ("recording", "export", path, "--format", form, "--out", tmp_path / "out")
     if form == "replay":
         arguments = ("recording", "replay", path)

@@ -23,7 +23,7 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperFault, GripperState, ObjectStatus
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
-from shearloop.emulators.gripper import Fingers
+from shearloop.emulators.gripper import Fingers, GripperRegisters
 from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation.values import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
@@ -173,6 +173,29 @@ async def test_a_tool_as_wide_as_the_target_may_be_held_although_it_is_not_felt(
         await task.grip(to_target)
         await task.grip(opening(target_mm + 20.0, 100.0))
         assert not felt[-1].may_hold
+
+
+@WAYS
+@pytest.mark.parametrize("gripped", [True, False])
+async def test_a_grip_does_not_activate_a_gripper_that_lost_its_power_with_a_tool(way, tmp_path, gripped):
+    """An activation opens the fingers, which may still hold the tool."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        rig.model.object_mm = 40.0
+        felt = Felt()
+        task = task_of(rig, felt)
+        await task.grip(GRIP)
+        felt.tool.was_gripped = gripped
+        held_mm = rig.model.width_mm
+        rig.model.write(GripperRegisters())
+        rig.model.step(STEP_S)
+        if not gripped:
+            await task.grip(GRIP)
+            return
+        with pytest.raises(NotBegunError, match="activation opens the fingers, and the gripped tool drops"):
+            await task.grip(GRIP)
+        assert (rig.model.width_mm, rig.model.sta) == (held_mm, 0)
+        await task.release()
+        assert rig.model.width_mm > 130.0
 
 
 @WAYS

@@ -3,7 +3,7 @@
 The report is a record, not a safety function. Only the pendant's safety configuration is rated.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
@@ -11,7 +11,7 @@ from typing import Final
 from shearloop.daemon.commissioning_report import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.motion_cap import CONTINUE, new_report
-from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
+from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, text_sha256s
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.errors import Hint, UserError
 from shearloop.yaml_files import load_model
@@ -24,11 +24,21 @@ _CLOCKS_DIFFER = timedelta(days=1)
 
 def old_stages(report: Report, config: DaemonConfig) -> list[tuple[StageResult, list[str]]]:
     """Return the stages that judged keys or files which have changed since, and these, for a sentence."""
-    hashes, found = judged_sha256s(config), []
+    hashes, texts = judged_sha256s(config), text_sha256s(config)
+    found = []
     for stage in report.stages:
         own, now = stage.judged_sha256s, judged_by(stage.stage, hashes)
-        if differs := [f"`{key}`" for key in sorted({*own, *now}) if own.get(key) != now.get(key)]:
-            found.append((stage, differs))
+        changed = [key for key in sorted({*own, *now}) if own.get(key) not in _hashes_of(key, now, texts)]
+        if changed:
+            found.append((stage, [f"`{key}`" for key in changed]))
+    return found
+
+
+def _hashes_of(key: str, now: Mapping[str, str], texts: Mapping[str, str]) -> list[str | None]:
+    """Return the hashes that a stage has of what it judged, if that is as it is now: those of earlier versions too."""
+    found = [now.get(key)]
+    if key in texts:
+        found.append(texts[key])
     return found
 
 

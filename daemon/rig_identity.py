@@ -15,8 +15,12 @@ from shearloop.daemon.commissioning_report import RigIdentity
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
+from shearloop.drivers.calibration_files import CalibrationModel, load_device_calibration
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.load_cell import LoadCalibration
+from shearloop.drivers.robotiq.models import DEFAULT_MODEL
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.script import own_script_hash
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
@@ -33,7 +37,7 @@ _TORQUE_KEYS: Final[Any] = {
     "fingertips": {"__all__": {"estimator", "matching", "baseline_frames", "average_frames", "creep"}},
     "combined": {"estimator", "creep"},
 }
-# Keys and files that only some stages judge, with the first figures of the stages. Of a file only the content counts.
+# Keys and calibrations that only some stages judge, with the first figures of the stages.
 _JUDGED_BY: Final = {
     "gripper.calibration": "2",
     "reaction_s": "3",
@@ -55,11 +59,12 @@ def identity_of(
     that the configuration names cannot be read.
     """
     settings, _ = _settings_of(config)
-    devices = _sha256_of(config.real.model_dump(mode="json", exclude_defaults=True, include=_DEVICE_KEYS))
-    as_written = _sha256_of(config.real.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS))
+    devices, *earlier = _device_sha256s(config.real)
+    if found is not None and found.configuration_sha256 in earlier:
+        devices = found.configuration_sha256
     return RigIdentity(
         emulated=config.emulated,
-        configuration_sha256=as_written if found is not None and found.configuration_sha256 == as_written else devices,
+        configuration_sha256=devices,
         robot_settings_sha256=_sha256_of(settings),
         script_sha256=own_script_hash(),
         ur_rtde=_installed("ur-rtde"),
@@ -68,19 +73,55 @@ def identity_of(
     )
 
 
+def _device_sha256s(config: DaemonConfig) -> list[str]:
+    """Return the hash of the devices' settings, and after it those of earlier versions."""
+    effective = config.model_dump(mode="json", exclude_defaults=True, include=_DEVICE_KEYS)
+    as_written = config.model_dump(mode="json", exclude_unset=True, include=_DEVICE_KEYS)
+    found = [effective, as_written]
+    if config.gripper is not None and config.gripper.model == DEFAULT_MODEL:
+        # This model was the default, and its key was absent.
+        for settings in (effective, as_written):
+            gripper = {key: value for key, value in settings["gripper"].items() if key != "model"}
+            found.append({**settings, "gripper": gripper})
+    return [_sha256_of(settings) for settings in found]
+
+
 def judged_sha256s(config: DaemonConfig) -> dict[str, str]:
-    """Return the hash of each value and file that only some stages judge, by its key; raises UserError."""
-    real = config.real
+    """Return the hash of each value and calibration that only some stages judge, by its key; raises UserError.
+
+    Of a calibration the values count, not the text: comments and a default that is written out change nothing.
+    """
     _, judged = _settings_of(config)
-    gripper, load_cell = real.gripper, real.load_cell
-    contents = {
-        "gripper.calibration": gripper.calibration if gripper is not None else None,
-        "load_cell.calibration": load_cell.calibration if load_cell is not None else None,
-    }
+    for name, (path, model) in _calibrations(config).items():
+        judged[name] = _values_of(path, model)
+    load_cell = config.real.load_cell
     if load_cell is not None and load_cell.direction is not None:
         judged["load_cell.direction"] = load_cell.direction
-    hashes = {name: _sha256_of(value) for name, value in judged.items()}
-    return hashes | {name: _sha256_of_file(path) for name, path in contents.items()}
+    return {name: _sha256_of(value) for name, value in judged.items()}
+
+
+def text_sha256s(config: DaemonConfig) -> dict[str, str]:
+    """Return the hash of each calibration's text, which reports of earlier versions have; raises UserError."""
+    return {name: _sha256_of_file(path) for name, (path, _) in _calibrations(config).items()}
+
+
+def _calibrations(config: DaemonConfig) -> dict[str, tuple[Path | None, type[CalibrationModel]]]:
+    """Return the file and the model of each calibration that some stages judge, by its key."""
+    gripper, load_cell = config.real.gripper, config.real.load_cell
+    return {
+        "gripper.calibration": (gripper.calibration if gripper is not None else None, WidthCalibration),
+        "load_cell.calibration": (load_cell.calibration if load_cell is not None else None, LoadCalibration),
+    }
+
+
+def _values_of(path: Path | None, model: type[CalibrationModel]) -> dict[str, Any] | None:
+    """Return the values of a calibration that are no defaults, and None without a file; raises UserError."""
+    if path is None:
+        return None
+    try:
+        return load_device_calibration(path, model).model_dump(mode="json", exclude_defaults=True)
+    except DriverError as error:
+        raise UserError(str(error)) from error
 
 
 def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:

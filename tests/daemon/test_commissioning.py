@@ -17,7 +17,7 @@ from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperiment
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S, measured_widths
 from shearloop.daemon.report_in_use import commissioning_of
-from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report
+from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report, old_stages
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
 from shearloop.drivers.ur.client import UrRobot
@@ -449,6 +449,52 @@ def test_a_report_whose_configuration_wrote_a_default_out_still_counts(tmp_path)
     found = commissioned(tmp_path, changed(report, configuration_sha256=as_written), **written)
     assert found.counts
     assert not commissioned(tmp_path, changed(report, configuration_sha256="0"), **written).counts
+
+
+@pytest.mark.parametrize(("model", "counts"), [("2F-140", True), ("Hand-E", False)])
+def test_a_report_from_before_the_grippers_model_was_required_counts_for_that_model(tmp_path, model, counts):
+    """Its configuration had no `model`, and meant a 2F-140."""
+    socket = {"socket": {"host": "192.168.1.10"}}
+    rig = {"gripper": {"model": model, **socket}}
+    report = report_of(write_rig(tmp_path, **rig), "01357", SUPPLIED)
+    devices = {"gripper": socket, "load_cell": {"device": {"serial_number": "7583"}}}
+    before = hashlib.sha256(json.dumps(devices, sort_keys=True).encode()).hexdigest()
+    assert commissioned(tmp_path, changed(report, configuration_sha256=before), **rig).counts == counts
+
+
+GRIPPER = {"open_counts": 3.0, "closed_counts": 230.0, "open_mm": 140.0, "std_mm": 1.0}
+
+
+def with_calibrations(folder: Path) -> dict[str, object]:
+    (folder / "cell.yaml").write_text(yaml.safe_dump(CELL))
+    (folder / "gripper.yaml").write_text(yaml.safe_dump(GRIPPER))
+    return {
+        "load_cell": {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"},
+        "gripper": {"model": "2F-140", "socket": {"host": "192.168.1.10"}, "calibration": "gripper.yaml"},
+        "commissioned": "report.yaml",
+    }
+
+
+def test_a_comment_or_a_default_that_a_calibration_writes_out_keeps_the_report(tmp_path):
+    path = write_rig(tmp_path, **with_calibrations(tmp_path))
+    report = report_of(path, "01234567", SUPPLIED)
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump({"model": "2F-140", **GRIPPER}))
+    (tmp_path / "cell.yaml").write_text("# weighed by Ann\n" + yaml.safe_dump({**CELL, "sign": 1}))
+    assert old_stages(report, load_daemon_config(path)) == []
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump({**GRIPPER, "std_mm": 2.0}))
+    ((stage, keys),) = old_stages(report, load_daemon_config(path))
+    assert (stage.stage, keys) == ("2 s", ["`gripper.calibration`"])
+
+
+def test_a_report_with_the_hash_of_a_calibrations_text_counts_while_the_text_is_the_same(tmp_path):
+    path = write_rig(tmp_path, **with_calibrations(tmp_path))
+    report = report_of(path, "2", SUPPLIED)
+    text = {"gripper.calibration": hashlib.sha256((tmp_path / "gripper.yaml").read_bytes()).hexdigest()}
+    (stage,) = report.stages
+    report = report.model_copy(update={"stages": (stage.model_copy(update={"judged_sha256s": text}),)})
+    assert old_stages(report, load_daemon_config(path)) == []
+    rewrite(tmp_path / "gripper.yaml", std_mm=2.0)
+    assert len(old_stages(report, load_daemon_config(path))) == 1
 
 
 def test_a_report_that_was_edited_to_a_faster_wrist_is_refused(tmp_path):

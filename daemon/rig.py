@@ -332,7 +332,7 @@ def build_rig(
     robot = UrRobot(settings, link, settings_for=settings_for, holds=holds)
     memory: RigMemory | NoMemory = NoMemory()
     if keeps_memory(config):
-        memory = RigMemory(files, loop, sensors.load_cell, WrenchZero(loop, robot))
+        memory = RigMemory(files, loop, sensors.load_cell, WrenchZero(loop, robot), clock)
         memory.restore()
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, memory.save_present)
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning, LoadedFiles.of(config))

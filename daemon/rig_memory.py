@@ -6,16 +6,16 @@ Each robot has a file.
 import asyncio
 import errno
 import json
-import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import structlog
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.grip import NO_GRIP, Grip, OnJudged
@@ -34,6 +34,8 @@ FOLLOWS_S = 0.1
 CLAMPED_ANOTHER = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
 # A state takes some hundred bytes.
 _MAX_BYTES = 1 << 16
+# A Unix time in s that is a date in every time zone: the year 9999 ends a day later.
+UnixTime = Annotated[float, Field(ge=0, le=253_402_214_400)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,7 @@ class Remembered:
     running: str = ""
     # Code and detail of each fault of the stop that waits for the operator, and its Unix time in s, where it is known.
     stop: tuple[tuple[str, str], ...] = ()
-    stopped_s: float | None = None
+    stopped_s: UnixTime | None = None
     # The grip, as `Grip` has it.
     origin_rad: float | None = None
     force_n: float | None = None
@@ -133,6 +135,7 @@ class RigMemory:
     loop: ControlLoop
     load_cell: LoadCell | None
     wrench: WrenchZero
+    clock: Clock
     error: str = ""
     # The experiment that is about to begin.
     _starting: str = ""
@@ -218,8 +221,12 @@ class RigMemory:
         """Write the present state, unless the file has it already; return why it cannot be written, or None."""
         self.wrench.watch()
         state = Remembered.of(self.loop)
-        stopped_s = self._stopped_s if self._stop_waits else time.time()
-        self._stop_waits, self._stopped_s = bool(state.stop), stopped_s if state.stop else None
+        stop_waits = bool(state.stop)
+        if not stop_waits:
+            self._stopped_s = None
+        elif not self._stop_waits:
+            self._stopped_s = self.clock.unix_s(self.clock.now_ns())
+        self._stop_waits = stop_waits
         state = replace(state, running=state.running or self._starting, stopped_s=self._stopped_s)
         if self.load_cell is not None and self.loop.tool.may_be_loaded() and self._knows_load_zero:
             calibration = self.load_cell.calibration
@@ -273,7 +280,7 @@ def read_memory(path: Path) -> Remembered:
         return validated(content, Remembered, str(path), ValueError)
     except FileNotFoundError:
         return Remembered()
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         unreadable = f"its state in {path} cannot be read: {error}"
         return Remembered(stop=((FaultCode.DAEMON_ENDED.name, unreadable),))
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Action, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile, GripStep
@@ -143,9 +144,14 @@ def phase(rig: Rig) -> ExperimentPhase:
 
 
 def memory_of(
-    loop: ControlLoop, cell: LoadCell | None = None, robot: UrRobot | None = None, files: RobotFiles = FILES
+    loop: ControlLoop,
+    cell: LoadCell | None = None,
+    robot: UrRobot | None = None,
+    files: RobotFiles = FILES,
+    clock: Clock | None = None,
 ) -> RigMemory:
     """Return the restored memory of a rig, whose robot is not connected unless a test has its own."""
-    memory = RigMemory(files, loop, cell, WrenchZero(loop, UrRobot(SETTINGS) if robot is None else robot))
+    wrench = WrenchZero(loop, UrRobot(SETTINGS) if robot is None else robot)
+    memory = RigMemory(files, loop, cell, wrench, Clock() if clock is None else clock)
     memory.restore()
     return memory

@@ -235,7 +235,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
         return [f"tare: the zero of {', '.join(reply['taring'])} is being taken{without}; {end}"]
     if name == "stop":
         if reply.get("ended"):
-            return ["stop: nothing was moving; the daemon has ended"]
+            return [f"stop: {stop_client.nothing_moved(reply)}; this stop ends the daemon"]
         if reply.get("held"):
             return [
                 f"stop: {stop_client.nothing_moved(reply)}, and {reply['held']}. The daemon continues, so that "
@@ -246,7 +246,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             return [f"stop: {stop_client.nothing_moved(reply)}; after 5 s, a further stop ends the daemon"]
         if reply.get("idle"):
             continues = "the daemon continues, because the stop came too late to end it"
-            return [f"stop: nothing was moving; {continues}. Send it again to end the daemon"]
+            return [f"stop: {stop_client.nothing_moved(reply)}; {continues}. Send it again to end the daemon"]
         stopped = f"stopped {reply['stopped']}" if reply.get("stopped") else stop_client.nothing_moved(reply)
         return [f"stop: {stopped}"]
     values = {key: ", ".join(value) if isinstance(value, list) else value for key, value in reply.items()}

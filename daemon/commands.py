@@ -298,11 +298,12 @@ class Commands:
             return {
                 "stopped": "",
                 "idle": True,
+                **ended,
                 "daemon": {"instance": self.running_rig.instance, "now_ns": self.now_ns()},
             }
         # Nothing moves, so the daemon itself stops, once the reply is sent.
         asyncio.get_running_loop().call_later(STOP_DELAY_S, self.daemon_end.set)
-        return {"ended": True}
+        return {"ended": True, **ended}
 
     def _may_end_daemon(self, request: Request) -> bool:
         """Return whether a stop where nothing moves may end the daemon: it is known to be of now, and for this one.

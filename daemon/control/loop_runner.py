@@ -131,7 +131,8 @@ class ControlLoopRunner:
     def just_ended(self) -> dict[str, str]:
         """Return the experiment that ended so lately that a person may not have seen it, for the reply to a stop.
 
-        It is `stopped_before`, by a person, or `ended_by_itself`; `because` is what stopped it. Empty without one.
+        It is `stopped_before`, by a person, or `ended_by_itself`; `because` is the fault that stopped it, if one did.
+        Empty without one.
         """
         experiment, ended_ns = self._control_loop.experiment, self._ended_ns
         if experiment is None or ended_ns is None or self._clock.now_ns() - ended_ns > UNSEEN_S * 1e9:
@@ -141,7 +142,9 @@ class ControlLoopRunner:
         if experiment.phase is not ExperimentPhase.STOPPED or stop is None:
             return {"ended_by_itself": name}
         asked = any(fault.code is FaultCode.OPERATOR_STOP for fault in stop.faults)
-        return {"stopped_before" if asked else "ended_by_itself": name, "because": stop.faults[0].cause}
+        ended = {"stopped_before" if asked else "ended_by_itself": name}
+        first = stop.faults[0]
+        return ended if first.code is FaultCode.OPERATOR_STOP else {**ended, "because": first.cause}
 
     def close(self) -> None:
         """Stop the running experiment at the daemon's end, and start nothing more."""

@@ -142,11 +142,13 @@ def send_to_stop_socket(address: str, content: Mapping[str, Any], timeout_s: flo
 
 def nothing_moved(reply: Mapping[str, Any]) -> str:
     """Return in words that a stop has found nothing that moved, and what may have moved when the person asked."""
-    name, because = reply.get("ended_by_itself") or reply.get("stopped_before"), reply.get("because")
-    if not name:
+    ended, stopped, because = (reply.get(key) for key in ("ended_by_itself", "stopped_before", "because"))
+    if not (ended or stopped):
         return "nothing was moving"
-    how = f"had just been stopped, because {because}" if because else "had just ended by itself"
-    return f"nothing moves any more: {name!r} {how}"
+    how = "had just ended by itself" if ended else "had just been stopped by an earlier stop"
+    if because:
+        how = f"had just been stopped, because {because}"
+    return f"nothing moves any more: {ended or stopped!r} {how}"
 
 
 def foreign_reply(address: str, error: Exception) -> UserError:

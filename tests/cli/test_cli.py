@@ -832,8 +832,24 @@ def test_a_stop_ends_an_idle_daemon_by_a_second_request_that_names_its_age(in_ti
     assert len(asked) == 1 + in_time
     said = capsys.readouterr().out
     assert said.startswith("stop: nothing was moving; ")
-    assert ("the daemon has ended" in said) is in_time
+    assert ("this stop ends the daemon" in said) is in_time
     assert ("Send it again to end the daemon" in said) is not in_time
+
+
+@pytest.mark.parametrize(
+    ("reply", "happens"),
+    [
+        ({"ended": True}, "this stop ends the daemon"),
+        (
+            {"idle": True},
+            "the daemon continues, because the stop came too late to end it. Send it again to end the daemon",
+        ),
+    ],
+)
+def test_a_second_stop_says_what_the_first_one_stopped(reply, happens):
+    stopped = "nothing moves any more: 'hold' had just been stopped by an earlier stop"
+    assert _lines("stop", {**reply, "stopped_before": "hold"}) == [f"stop: {stopped}; {happens}"]
+    assert _lines("stop", reply) == [f"stop: nothing was moving; {happens}"]
 
 
 def test_a_stop_imports_little():

@@ -55,7 +55,7 @@ def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, mo
         assert ready.wait(DEADLINE_S)
         assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
         assert daemon.result(DEADLINE_S) == 0
-    assert "stop: nothing was moving; the daemon has ended" in capsys.readouterr().out
+    assert "stop: nothing was moving; this stop ends the daemon" in capsys.readouterr().out
 
 
 class Cycle:

@@ -761,7 +761,7 @@ async def test_a_stop_that_is_sent_again_is_told_what_the_first_one_stopped():
         await cell.cycles(5)
         reply = await stop_command({"spare_daemon": True})
         assert (reply["stopped"], reply["stopped_before"]) == ("", "test")
-        assert "because the operator stopped it: 'test' was under way" in nothing_moved(reply)
+        assert nothing_moved(reply) == "nothing moves any more: 'test' had just been stopped by an earlier stop"
 
 
 @pytest.mark.parametrize("acknowledged", [False, True])
@@ -773,7 +773,10 @@ async def test_a_second_stop_of_an_operator_ends_the_daemon_at_once(acknowledged
         await cell.cycles(5)
         if acknowledged:
             cell.control_loop.acknowledge()
-        assert await stop_command(of_now()) == {"ended": True, **THIS_DAEMON}
+        reply = await stop_command(of_now())
+        assert reply == {"ended": True, "stopped_before": "test", **THIS_DAEMON}
+        late = await stop_command({"until_ns": 1})
+        assert (late["idle"], late["stopped_before"]) == (True, "test")
 
 
 def test_a_stated_diameter_that_an_uncalibrated_gripper_does_not_fit_is_noted_while_its_tool_is_held():

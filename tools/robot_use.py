@@ -2,6 +2,8 @@
 
 import re
 from contextlib import closing, suppress
+from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Final
 
 from shearloop.drivers.errors import DriverError
@@ -12,7 +14,6 @@ from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.script import FIRST_WITH_LOWER_ALONE, LOWER, UPPER, ScriptRegisters
 from shearloop.errors import UserError
 
-FREE: Final = "free"
 # The rated payloads in kg of UR's data sheets, by PolyScope's major version and the dashboard's model. A UR10e of an
 # earlier year is rated 10 kg.
 _RATED_KG: Final = {3: {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}, 5: {"UR3": 3.0, "UR5": 5.0, "UR10": 12.5, "UR16": 16.0}}
@@ -43,18 +44,41 @@ def beyond_rated(payload_kg: float | None, model: str, rated_kg: float | None) -
     return f"{payload_kg:g} kg is above the rated payload of this {model}, {rated_kg:g} kg"
 
 
-def registers_in_words(seen: ControllerInfo) -> str:
-    """Return which input registers other clients write, or `FREE`.
+class Registers(Enum):
+    """Which input registers other clients write, in words."""
+
+    FREE = "free"
+    UPPER_IN_USE = "those from 24 on are in use, and the lower ones free"
+    ALL_IN_USE = "in use"
+
+
+class SignKind(Enum):
+    """What shows that another program commands the robot."""
+
+    REGISTERS = auto()
+    PROGRAM = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Sign:
+    """A sign of another program that commands the robot, with a whole sentence."""
+
+    kind: SignKind
+    sentence: str
+
+
+def used_registers(seen: ControllerInfo) -> Registers:
+    """Return which input registers other clients write.
 
     A daemon takes those from 24 on where it can. A controller on which it uses the lower ones alone shows nothing of
     the others.
     """
     if seen.registers is None:
-        return "in use"
+        return Registers.ALL_IN_USE
     major, minor, *_ = map(int, seen.version.split("."))
     if seen.registers == LOWER and (major, minor) < FIRST_WITH_LOWER_ALONE:
-        return "those from 24 on are in use, and the lower ones free"
-    return FREE
+        return Registers.UPPER_IN_USE
+    return Registers.FREE
 
 
 def program_in_words(outputs: RtdeOutputs) -> str:
@@ -64,19 +88,22 @@ def program_in_words(outputs: RtdeOutputs) -> str:
     return RUNTIME_STATES.get(outputs.runtime_state, f"unknown state {outputs.runtime_state}")
 
 
-def other_programs(seen: ControllerInfo, outputs: RtdeOutputs) -> list[str]:
-    """Return a sentence on each sign of another program that commands the robot; none of this process may run."""
+def other_programs(seen: ControllerInfo, outputs: RtdeOutputs) -> list[Sign]:
+    """Return each sign of another program that commands the robot; none of this process may run."""
     found = []
-    if (registers := registers_in_words(seen)) != FREE:
-        found.append(
-            f"Another program writes the robot's registers ({registers}): a daemon of another user or computer, "
+    registers = used_registers(seen)
+    if registers is not Registers.FREE:
+        sentence = (
+            f"Another program writes the robot's registers ({registers.value}): a daemon of another user or computer, "
             "another RTDE client or a fieldbus. It may move the robot and the gripper at any moment."
         )
+        found.append(Sign(SignKind.REGISTERS, sentence))
     if program := program_in_words(outputs):
-        found.append(
+        sentence = (
             f"A program is on the robot that was not started from here ({program}). It may be of a daemon of another "
             "user or computer, or of the pendant, and may hold a tool."
         )
+        found.append(Sign(SignKind.PROGRAM, sentence))
     return found
 
 
@@ -85,4 +112,5 @@ def refuse_used_robot(host: str, timeout_s: float) -> None:
     with suppress(DriverError):
         found = other_programs(query_controller(host, timeout_s), read_outputs(host, timeout_s))
         if found:
-            raise UserError(f"{' '.join(found)} End it first, or stop its program at the teach pendant")
+            sentences = " ".join(sign.sentence for sign in found)
+            raise UserError(f"{sentences} End it first, or stop its program at the teach pendant")

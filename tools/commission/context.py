@@ -21,7 +21,7 @@ from shearloop.tools.commission.mover import Mover
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.rig import Rig
-from shearloop.tools.robot_use import other_programs, program_in_words, registers_in_words
+from shearloop.tools.robot_use import Sign, SignKind, other_programs, program_in_words
 
 # With fewer stops of each layer a report raises no speed.
 STOPS_NEEDED: Final = 5
@@ -73,7 +73,7 @@ class Context:
     # Where the arm stood when the operator confirmed it.
     _confirmed: Seen | None = field(default=None, init=False)
     # The signs of other programs that the operator has accepted.
-    _accepted: set[str] = field(default_factory=set, init=False)
+    _accepted: set[Sign] = field(default_factory=set, init=False)
 
     @property
     def clock(self) -> Clock:
@@ -117,9 +117,11 @@ class Context:
             outputs = self.rig.outputs(self.registers)
         for sign in other_programs(seen, outputs):
             if sign not in self._accepted:
-                self.operator.accept(f"{sign} The commissioning replaces such a program, and moves robot and gripper.")
+                moves = "The commissioning replaces such a program, and moves robot and gripper."
+                self.operator.accept(f"{sign.sentence} {moves}")
                 # A program is replaced; a client keeps its registers.
-                self._accepted.update({sign} if registers_in_words(seen) in sign else ())
+                if sign.kind is SignKind.REGISTERS:
+                    self._accepted.add(sign)
 
     def _another_plays(self) -> bool:
         """Return whether a program plays whose clock, in the registers that we write, stands still."""

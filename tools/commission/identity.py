@@ -13,7 +13,7 @@ from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
 from shearloop.tools.commission.wrench import HEAVIEST_KG
-from shearloop.tools.robot_use import FREE, beyond_rated, program_in_words, registers_in_words
+from shearloop.tools.robot_use import Registers, beyond_rated, program_in_words, used_registers
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
@@ -93,12 +93,13 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
 
 def _other_programs(seen: ControllerInfo, outputs: RtdeOutputs) -> list[Line]:
     """Return the lines on other programs. Where some registers are left, the operator is asked before stage 1."""
-    registers, program = registers_in_words(seen), program_in_words(outputs)
-    promise = "no other program commands the robot"
-    if seen.registers is not None and registers != FREE:
-        lines = [Line(what="registers", value=f"{registers}: another program may command the robot", limit=FREE)]
+    registers, program = used_registers(seen), program_in_words(outputs)
+    promise, free = "no other program commands the robot", Registers.FREE.value
+    if registers is Registers.UPPER_IN_USE:
+        value = f"{registers.value}: another program may command the robot"
+        lines = [Line(what="registers", value=value, limit=free)]
     else:
-        lines = [judged("registers", registers, FREE, promise, passed=registers == FREE)]
+        lines = [judged("registers", registers.value, free, promise, passed=registers is Registers.FREE)]
     if program:
         lines.append(Line(what="program on the robot", value=f"{program}, and not of the commissioning", limit="none"))
     else:

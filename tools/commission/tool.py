@@ -4,7 +4,8 @@ import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from typing import Final
+from enum import Enum
+from typing import Final, Self
 
 from shearloop.daemon.commissioning_report import Line, Supplied
 from shearloop.daemon.control.experiment_schema import SIGNS, direction_of
@@ -40,6 +41,24 @@ _FELT: Final = 2
 _SLOWLY_RAD_PER_S: Final = 0.1
 _HELD_S: Final = 1.0
 _SETTLES_S: Final = 0.5
+
+
+class ChangeSign(Enum):
+    """The sign of a change."""
+
+    POSITIVE = 1
+    NEGATIVE = -1
+    NONE = 0
+
+    @classmethod
+    def of(cls, change: float) -> Self:
+        """Return the sign of a change; a device that shows none has no sign."""
+        return cls((change > 0) - (change < 0))
+
+    @property
+    def words(self) -> str:
+        """The sign in words."""
+        return "no change" if self is ChangeSign.NONE else self.name.lower()
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,46 +230,41 @@ def judge_signs(
     A wrench that is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on
     recordings of real fingertips may refuse `emulated` frames.
     """
-    lines: list[Line] = []
-    wanted = _sign(way)
-    found = {
-        "command": wanted if said == direction_of(way) else f"the operator said {said!r}",
-        "wrist": _sign(after.wrist_rad - before.wrist_rad),
-        "load cell": _sign(after.load_nm - before.load_nm),
-    }
+    wanted = ChangeSign(way)
+
+    def compared(what: str, change: float) -> Line:
+        found = ChangeSign.of(change)
+        return _sign_line(what, found.words, wanted, passed=found is wanted)
+
+    is_right = said == direction_of(way)
+    lines = [
+        _sign_line("command", wanted.words if is_right else f"the operator said {said!r}", wanted, passed=is_right),
+        compared("wrist", after.wrist_rad - before.wrist_rad),
+        compared("load cell", after.load_nm - before.load_nm),
+    ]
     if abs(after.load_nm - before.load_nm) >= wrench_noise_nm:
-        found["wrench"] = _sign(after.wrench_nm - before.wrench_nm)
+        lines.append(compared("wrench", after.wrench_nm - before.wrench_nm))
     else:
         noise = f"not measured: the robot estimates its wrench to {wrench_noise_nm:g} N·m, and the twist is smaller"
         lines.append(Line(what="sign of the wrench", value=noise))
     for name, after_nm in after.tactile_nm.items():
-        before_nm = before.tactile_nm[name]
-        if after_nm is None or before_nm is None:
-            refused = "no estimate in the grip"
-            if emulated:
-                lines.append(Line(what=f"sign of the estimate of {name}", value=f"not measured: {refused}"))
-            else:
-                found[f"estimate of {name}"] = refused
+        before_nm, what = before.tactile_nm[name], f"estimate of {name}"
+        if after_nm is not None and before_nm is not None:
+            lines.append(compared(what, after_nm - before_nm))
+        elif emulated:
+            lines.append(Line(what=f"sign of the {what}", value="not measured: no estimate in the grip"))
         else:
-            found[f"estimate of {name}"] = _sign(after_nm - before_nm)
-    lines += [
-        judged(
-            f"sign of the {what}",
-            value,
-            f"{wanted}, {direction_of(way)} for an eye that faces the gripper",
-            "the loop turns the right way",
-            passed=value == wanted,
-        )
-        for what, value in found.items()
-    ]
+            lines.append(_sign_line(what, "no estimate in the grip", wanted, passed=False))
     if not after.tactile_nm:
         unmeasured = "not measured: it needs a gripper, and a fingertip with a calibration"
         lines.append(Line(what="sign of the estimate", value=unmeasured))
     return lines
 
 
-def _sign(change: float) -> str:
-    return "positive" if change > 0 else "negative"
+def _sign_line(what: str, value: str, wanted: ChangeSign, *, passed: bool) -> Line:
+    """Return the line on one sign."""
+    limit = f"{wanted.words}, {direction_of(wanted.value)} for an eye that faces the gripper"
+    return judged(f"sign of the {what}", value, limit, "the loop turns the right way", passed=passed)
 
 
 def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]]:

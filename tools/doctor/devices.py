@@ -42,7 +42,7 @@ from shearloop.tools.doctor.boards import (
     table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
-from shearloop.tools.robot_use import FREE, beyond_rated, read_outputs, read_rated_kg, registers_in_words
+from shearloop.tools.robot_use import Registers, beyond_rated, read_outputs, read_rated_kg, used_registers
 from shearloop.tools.task_row import task_row
 
 ROBOT_TIMEOUT_S = 2.0
@@ -147,16 +147,17 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
         cure = "make the cell safe, start the daemon, then send `shearloop command unlock`"
         yield note("robot's mode", mode, "the arm does not move in this mode", cure)
     yield from _check_setting(settings, seen)
-    registers = registers_in_words(seen)
-    if registers == FREE:
-        yield good("robot's registers", registers)
-    elif seen.registers is not None:
-        means = "a daemon of another user or computer, another RTDE client or a fieldbus may command the robot"
-        yield note("robot's registers", registers, means, "end the other program if it commands the robot")
-    else:
-        means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
-        cure = f"close the other program, or disable the adapter ({FIELDBUS_MENU})"
-        yield trouble("robot's registers", "in use", means, cure)
+    registers, subject = used_registers(seen), "robot's registers"
+    match registers:
+        case Registers.FREE:
+            yield good(subject, registers.value)
+        case Registers.UPPER_IN_USE:
+            means = "a daemon of another user or computer, another RTDE client or a fieldbus may command the robot"
+            yield note(subject, registers.value, means, "end the other program if it commands the robot")
+        case Registers.ALL_IN_USE:
+            means = "another RTDE client, EtherNet/IP or PROFINET commands the robot"
+            cure = f"close the other program, or disable the adapter ({FIELDBUS_MENU})"
+            yield trouble(subject, registers.value, means, cure)
 
 
 def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Finding]:

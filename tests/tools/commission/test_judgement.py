@@ -330,6 +330,13 @@ def test_each_flipped_sign_fails_its_line(after, said, lines):
     assert failed(judge_signs(Held(0.0, 0.0, 0.0, dict.fromkeys(after.tactile_nm, 0.0)), after, said)) == lines
 
 
+@pytest.mark.parametrize("way", [1, -1])
+def test_a_device_that_shows_no_change_has_no_sign(way):
+    said = "counterclockwise" if way == 1 else "clockwise"
+    before, dead = Held(0.0, 0.0, 0.0), Held(0.08 * way, 0.0, 0.05 * way)
+    assert failed(judge_signs(before, dead, said, way=way)) == ["sign of the load cell"]
+
+
 def test_emulated_frames_that_a_calibration_refuses_fail_nothing():
     before = Held(0.0, 0.0, 0.0, {"right": 0.0})
     lines = judge_signs(before, Held(0.08, 0.05, 0.05, {"right": None}), "counterclockwise", emulated=True)

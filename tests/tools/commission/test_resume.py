@@ -18,6 +18,7 @@ from shearloop.tools.commission import procedure
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.operator import WORD, DeclinedError, Operator
 from shearloop.tools.commission.report import Measured
+from shearloop.tools.robot_use import SignKind, other_programs
 from tests.tools.commission.test_commission import OUTPUTS, write_rig
 
 CONTROLLER = ControllerInfo("5.17.3.0", "1", "RUNNING", "NORMAL", remote=True, registers=UPPER)
@@ -95,13 +96,20 @@ def test_stages_are_kept_blocked_and_continued(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("ur_rtde")
 @pytest.mark.parametrize(
-    ("registers", "runtime_state", "said"),
-    [(LOWER, 1, "those from 24 on are in use"), (UPPER, 2, "(playing)"), (UPPER, 4, "(paused)")],
+    ("registers", "runtime_state", "said", "kind", "times"),
+    [
+        (LOWER, 1, "those from 24 on are in use", SignKind.REGISTERS, 1),
+        (UPPER, 2, "(playing)", SignKind.PROGRAM, 2),
+        (UPPER, 4, "(paused)", SignKind.PROGRAM, 2),
+    ],
 )
 def test_another_program_on_the_robot_is_named_before_each_stage_that_moves(
-    tmp_path, monkeypatch, registers, runtime_state, said
+    tmp_path, monkeypatch, registers, runtime_state, said, kind, times
 ):
-    """It may be a daemon's of another user or of another computer, which no lock of this one shows."""
+    """It may be a daemon's of another user or of another computer, which no lock of this one shows.
+
+    A program is asked about each time, because it is replaced; registers are asked about once.
+    """
     ran = play_stages(monkeypatch, dict.fromkeys(("0 identity", "1 b", "2 c"), "passed"))
     path, out, asked = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
     controller, outputs = replace(CONTROLLER, registers=registers), replace(OUTPUTS, runtime_state=runtime_state)
@@ -118,9 +126,13 @@ def test_another_program_on_the_robot_is_named_before_each_stage_that_moves(
     with pytest.raises(DeclinedError, match="not accepted"):
         run("no")
     assert ran == ["0 identity"], "nothing moves before the word"
-    assert said in next(question for question in asked if "Type `continue`" in question)
+    (sign,) = other_programs(controller, outputs)
+    assert sign.kind is kind
+    assert said in sign.sentence
+    asked.clear()
     run("continue")
     assert ran == ["0 identity", "1 b", "2 c"]
+    assert sum(question.startswith(sign.sentence) for question in asked) == times
 
 
 @pytest.mark.usefixtures("ur_rtde")

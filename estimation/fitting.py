@@ -7,6 +7,7 @@ Nothing looks at the recordings that the calibration will be evaluated on.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -162,9 +163,9 @@ def _fit_outputs(
 ) -> Calibration:
     """Return the calibration with its outputs; the torques may be off by the uncertainty in time."""
     matcher = calibration.matcher(physics.bank)
-    rows, against = _replay(calibration, matcher, recordings)
+    rows, refused = _replay(calibration, matcher, recordings)
     if rows is None:
-        raise CalibrationError(f"no frame of the recordings can be calibrated on: {_most_frequent(against)}")
+        raise CalibrationError(f"no frame of the recordings can be calibrated on: {_most_frequent(refused)}")
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))
@@ -276,14 +277,17 @@ def adapt(
     check_finite(recordings)
     recordings = [recording.select_sides(calibration.sides) for recording in recordings]
     first_frames = first_frames or [0] * len(recordings)
-    rows, against = _replay(calibration, matcher, recordings)
+    if all(first >= len(recording.t_s) for recording, first in zip(recordings, first_frames, strict=True)):
+        raise CalibrationError("the recordings have no frame of the part to adapt on; use an earlier or a longer part")
+    rows, refused = _replay(calibration, matcher, recordings)
     if rows is not None:
         is_first = first_twists(rows.torque_nm, rows.grip)
         count = rows.frame >= np.array(first_frames)[rows.recording]
         rows, is_first = rows.where(count), is_first[count]
     if rows is None or not len(rows.frame):
+        of_part = [one for one in refused if one.frame >= first_frames[one.recording]]
         raise CalibrationError(
-            f"no frame can be adapted on: {_most_frequent(against)}; `shearloop evaluate` lists the reasons; twist the "
+            f"no frame can be adapted on: {_most_frequent(of_part)}; `shearloop evaluate` lists the reasons; twist the "
             "gripped tool again"
         )
     for number, recording in enumerate(recordings):
@@ -307,14 +311,22 @@ def _check_new(learned: LearnedFrames, recording: FrameSeries, frames: IntArray,
         )
 
 
+class _Refused(NamedTuple):
+    """A frame that gives no estimate: the number of its recording, its own number there, and why."""
+
+    recording: int
+    frame: int
+    why: str
+
+
 def _replay(
     calibration: Calibration, matcher: BankMatcher | None, recordings: Sequence[FrameSeries]
-) -> tuple[CalibrationRows | None, CountedReasons]:
+) -> tuple[CalibrationRows | None, list[_Refused]]:
     """Return the frames that give an estimate, processed as in a session, and why the others give none.
 
     The frames are None if no frame gives one.
     """
-    estimator, rows, grip, against = calibration.estimator, [], 0, CountedReasons()
+    estimator, rows, refused, grip = calibration.estimator, [], list[_Refused](), 0
     for recording, series in enumerate(recordings):
         session = Session(calibration, matcher=matcher, period_s=series.period_s)
         grip, before = grip + 1, GripState.NONE
@@ -325,11 +337,12 @@ def _replay(
                 grip += 1
             before = processed.grip
             if processed.reasons or not np.isfinite(truth[0]):
-                against.add(processed.reasons[0] if processed.reasons else _NO_TRUE_TORQUE)
+                why = processed.reasons[0] if processed.reasons else _NO_TRUE_TORQUE
+                refused.append(_Refused(recording, i, why))
                 continue
             reading = Reading.of(processed, t_s, matcher)
             if reading.is_ambiguous:
-                against.add(_NO_ONE_POSITION)
+                refused.append(_Refused(recording, i, _NO_ONE_POSITION))
                 continue
             # Before the gel was seen idle, its position means nothing, and so the frame shows no diameter.
             torque_nm, diameter_mm = truth if processed.has_baseline else (truth[0], np.nan)
@@ -339,11 +352,14 @@ def _replay(
                 for difference in (processed.difference, processed.mean_difference)
             )
             rows.append((recording, i, t_s - float(series.t_s[0]), features, *places, torque_nm, diameter_mm, grip))
-    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None, against
+    return CalibrationRows(*map(np.array, zip(*rows, strict=True))) if rows else None, refused
 
 
-def _most_frequent(against: CountedReasons) -> str:
+def _most_frequent(refused: Sequence[_Refused]) -> str:
     """Return what refuses most frames that are gripped, with their number; else what refuses most of all."""
+    against = CountedReasons()
+    for one in refused:
+        against.add(one.why)
     counts = against.most_frequent_first
     gripped = [(count, why) for count, why in counts if why in (_NO_ONE_POSITION, _NO_TRUE_TORQUE)]
     count, why = (gripped or counts)[0]

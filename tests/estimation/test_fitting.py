@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.estimation import TRUSTED, Physics, Session, fit
+from shearloop.estimation import TRUSTED, Physics, Session, adapt, fit
 from shearloop.estimation.bank_estimators import BankEstimator
 from shearloop.estimation.bank_match import BankMatch
 from shearloop.estimation.estimator import Estimator, OutputModel
@@ -127,3 +127,24 @@ def test_a_bank_in_which_no_frame_has_one_position_is_named_as_the_cause(monkeyp
     monkeypatch.setattr(BankEstimator, "matcher", lambda *_: TwoPositions())
     with pytest.raises(CalibrationError, match=r"two positions of the bank.* fit the frame equally well.* \(\d{2,} of"):
         fit("bank", [twisting(tips=(1,))], "rig", Physics(bank=bank), timing=TRUSTED)
+
+
+@pytest.mark.parametrize(
+    ("part", "first", "said"),
+    [
+        (slice(0, 297), 270, r"no frame can be adapted on: no grip at the right .* \(27 of 27 frames\)"),
+        (slice(0, 140), 140, r"the recordings have no frame of the part to adapt on"),
+        (slice(40, 140), 100, r"the recordings have no frame of the part to adapt on"),
+    ],
+    ids=["released again", "at the end", "gripped at its beginning"],
+)
+def test_frames_before_the_part_to_adapt_on_are_not_its_cause(part, first, said, motion_calibration):
+    """Frames before it are usable, and others there have no grip."""
+    recording = twisting(seed=7, peak_nm=0.08).between(part.start, part.stop)
+    with pytest.raises(CalibrationError, match=said):
+        adapt(motion_calibration, [recording], "x", first_frames=[first])
+
+
+def test_adapting_on_no_recording_is_refused(motion_calibration):
+    with pytest.raises(CalibrationError, match="the recordings have no frame of the part"):
+        adapt(motion_calibration, [], "x")

@@ -19,6 +19,7 @@ from pydantic import (
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, load_yaml_model, not_of_kind
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging import addresses
+from shearloop.daemon.torques import SIGNS, Direction
 from shearloop.drivers import ranges
 from shearloop.drivers.defaults import (
     ADC_FULL_SCALE_V,
@@ -151,14 +152,14 @@ class LoadCellConfig(ConfigModel):
     device: SerialDevice = Field(description="the board's serial port")
     calibration: Path | None = Field(None, description="calibration; default: the board sends torques in N·m")
     rate_hz: float = Field(LOAD_CELL_RATE_HZ, gt=0, le=1000, description="lines per second")
-    direction: Literal["clockwise", "counterclockwise"] | None = Field(
+    direction: Direction | None = Field(
         None, description="the only direction of torques that the lever measures; default: both"
     )
 
     @property
     def only_sign(self) -> int:
         """The sign of the only torques that the lever measures; 0 for both."""
-        return {None: 0, "clockwise": -1, "counterclockwise": 1}[self.direction]
+        return 0 if self.direction is None else SIGNS[self.direction]
 
 
 class InstrumentSocket(ConfigModel):

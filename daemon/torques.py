@@ -1,11 +1,11 @@
-"""What sensors and control loop exchange: torques with their sources, zeros, and known torques."""
+"""What sensors and control loop exchange: torques with their sources and directions, zeros, and known torques."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from statistics import fmean
-from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Literal, NamedTuple, Protocol, runtime_checkable
 
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
@@ -26,6 +26,17 @@ UNLOAD = "take the load off (turn the tool back, or free it), then tare again"
 CONFIRM_TARE = f"{UNLOAD}; only if nothing touches the sensor, confirm it with `shearloop command tare --yes`"
 # The sources of the robot's own torque, and of the load cell's.
 WRENCH, LOAD_CELL = "wrench", "load_cell"
+# Of a turn or a torque, for an eye that faces the gripper.
+Direction = Literal["clockwise", "counterclockwise"]
+# One convention for every number of a file, and for recorded angles and torques.
+SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
+
+
+def direction_of(number: float) -> Direction | None:
+    """Return the direction of an angle or a torque; None for 0."""
+    if number == 0:
+        return None
+    return "clockwise" if number < 0 else "counterclockwise"
 
 
 @dataclass(frozen=True, slots=True)

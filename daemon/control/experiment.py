@@ -14,6 +14,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import TORQUE_TOLERANCE
 from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
+from shearloop.daemon.torques import SIGNS
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
@@ -312,7 +313,7 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
 
 def _tighten(step: steps.TightenStep) -> StepProgram:
     start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
-    sign = steps.SIGNS[step.direction]
+    sign = SIGNS[step.direction]
     velocity = ConstantVelocity(sign * step.speed_rad_per_s)
     while True:
         activity = f"turning {step.direction} until {step.until_torque_nm:.3f} N·m or {step.until_angle_rad:.2f} rad"

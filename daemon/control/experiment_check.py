@@ -9,7 +9,6 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
-    Direction,
     ExperimentFile,
     GripperStep,
     GripStep,
@@ -23,12 +22,11 @@ from shearloop.daemon.control.experiment_schema import (
     TurnToStep,
     TwistingStep,
     TwistStep,
-    direction_of,
     outline,
 )
 from shearloop.daemon.control.step_demands import demand
 from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
-from shearloop.daemon.torques import LOAD_CELL, WRENCH, TorqueSource
+from shearloop.daemon.torques import LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 from shearloop.estimation import Measured

@@ -1,7 +1,6 @@
 """The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 import math
-from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, get_args
 
 import numpy as np
@@ -9,6 +8,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError, WithJ
 
 from shearloop.daemon.config_file import NAMED_FILES, ConfigModel, FileKind, either, not_of_kind
 from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S
+from shearloop.daemon.torques import SIGNS, Direction
 from shearloop.drivers import ranges
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.robotiq.models import FORCES_N, LARGEST_STROKE_MM, SPEEDS_MM_PER_S
@@ -158,19 +158,6 @@ class TurnToStep(_Step):
     do: Literal["turn_to"]
     angle_rad: ranges.Angle = Field(description="angle of the wrist joint")
     speed_rad_per_s: ranges.WristSpeed = Field(CAPPED_RAD_PER_S, description="speed of the wrist")
-
-
-# Of a turn, for an eye that faces the gripper.
-Direction = Literal["clockwise", "counterclockwise"]
-# One convention for every number of a file, and for recorded angles and torques.
-SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
-
-
-def direction_of(number: float) -> Direction | None:
-    """Return the direction of an angle or a torque; None for 0."""
-    if number == 0:
-        return None
-    return "clockwise" if number < 0 else "counterclockwise"
 
 
 class HoldTorqueStep(_Step):

@@ -16,10 +16,8 @@ from enum import Enum
 from typing import Final, NamedTuple, TypeAlias
 
 from shearloop.daemon.control.experiment_schema import (
-    SIGNS,
     AdaptStep,
     ApproachStep,
-    Direction,
     GripStep,
     HoldTorqueStep,
     IdentifyStep,
@@ -31,8 +29,8 @@ from shearloop.daemon.control.experiment_schema import (
     TwistingStep,
     TwistStep,
     WaitStep,
-    direction_of,
 )
+from shearloop.daemon.torques import SIGNS, Direction, direction_of
 
 # A clamped tool that was turned by less is back at the angle of its zero.
 UNTURNED_RAD: Final = 0.02

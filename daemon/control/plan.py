@@ -13,7 +13,7 @@ from shearloop.daemon.control.step_demands import Demand, demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
 from shearloop.daemon.control.turns import Turn, either_way, reversals, turns, ways_between
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.torques import LOAD_CELL, WRENCH
+from shearloop.daemon.torques import LOAD_CELL, WRENCH, Direction, direction_of
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM, GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 
@@ -329,7 +329,7 @@ def _words(step: Step, turn: Turn, gripper: GripperModel | None, speeds: Speeds)
         case steps.TwistStep():
             return _twist(step, turn, speeds)
         case steps.HoldTorqueStep():
-            direction = steps.direction_of(step.signed_torque_nm)
+            direction = direction_of(step.signed_torque_nm)
             way = f" {direction}" if direction is not None else ""
             until = f"until the torque is {abs(step.torque_nm):g} N·m{way}"
             return f"turns the wrist {until}, and holds it for {step.hold_s:g} s"
@@ -379,7 +379,7 @@ def _twist(step: steps.TwistStep, turn: Turn, speeds: Speeds) -> str:
     return f"twists the wrist to {places} {since}{first}, {then}{times}, {_turning(step.speed_rad_per_s, speeds)}"
 
 
-def _turns_back(step: Step, begins: steps.Direction | None) -> bool:
+def _turns_back(step: Step, begins: Direction | None) -> bool:
     """Return whether a step turns the tool both ways; `hold_torque` does so only to correct.
 
     `begins` is the direction of its first turn, where that is known.

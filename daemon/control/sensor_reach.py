@@ -4,10 +4,10 @@ from collections.abc import Iterator, Mapping
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_schema import SIGNS, ExperimentFile, HoldTorqueStep, Step, TightenStep
+from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep, Step, TightenStep
 from shearloop.daemon.motion_cap import Commissioning, knows_tool
 from shearloop.daemon.reach import Reach
-from shearloop.daemon.torques import TorqueSource
+from shearloop.daemon.torques import SIGNS, TorqueSource
 from shearloop.drivers.ranges import LARGEST_TORQUE_NM
 from shearloop.estimation import Measured
 

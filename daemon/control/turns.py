@@ -5,7 +5,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
-    Direction,
     ExperimentFile,
     HoldTorqueStep,
     IdentifyStep,
@@ -15,9 +14,9 @@ from shearloop.daemon.control.experiment_schema import (
     TurnToStep,
     TwistingStep,
     TwistStep,
-    direction_of,
 )
 from shearloop.daemon.control.known_tool import AT_REST, STILL, Held, Interval, KnownTool, Ways, known_after, way_from
+from shearloop.daemon.torques import Direction, direction_of
 
 
 def only_way(ways: Ways) -> Direction | None:

@@ -8,10 +8,9 @@ from enum import Enum
 from typing import Final, Self
 
 from shearloop.daemon.commissioning_report import Line, Supplied
-from shearloop.daemon.control.experiment_schema import SIGNS, direction_of
 from shearloop.daemon.motion_cap import CAPPED_NM
 from shearloop.daemon.rig_identity import source_sha256
-from shearloop.daemon.torques import LOAD_CELL, WRENCH
+from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, direction_of
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.poses import tool_axis
 from shearloop.errors import UserError

@@ -10,10 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shearloop.daemon.control import experiment_schema as steps
-from shearloop.daemon.control.experiment_schema import SIGNS, ExperimentFile, Step, direction_of
+from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import NOTHING_KNOWN, TORQUE_TOLERANCE, UNTURNED_RAD, known_at_start
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.turns import reversals, turns
+from shearloop.daemon.torques import SIGNS, direction_of
 
 _SMALL = 1e-9
 

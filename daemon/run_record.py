@@ -47,6 +47,7 @@ class StepSummary:
     """The record of one step."""
 
     number: int
+    # Empty for a step that took no time: no message names it.
     name: str
     from_ns: int
     to_ns: int

@@ -167,4 +167,4 @@ def _update(run: Run, content: Mapping[str, Any]) -> None:
 def _add_passed(run: Run, next_number: int, now_ns: int) -> None:
     """Add the steps that took no time, such as `wait: 0`: no message has them."""
     while run.steps and run.steps[-1].number + 1 < next_number:
-        run.steps.append(StepSummary(run.steps[-1].number + 1, "at once", now_ns, now_ns))
+        run.steps.append(StepSummary(run.steps[-1].number + 1, "", now_ns, now_ns))

@@ -46,7 +46,8 @@ def lines_of(run: Run, truth: TorqueSeries | None, events: Events, *, asked_for:
         held = f"   {counted(step.holds, 'angle')} held" if step.holds else ""
         details = {"identify": run.identified, "twist": held}.get(step.name, "")
         paused = f"   {step.paused_s:.1f} s of them paused" if step.paused_s else ""
-        yield f"  step {step.number} of {run.first['steps']}  {step.name:<12} {took_s:6.1f} s{paused}{details}"
+        name = step.name or "at once"
+        yield f"  step {step.number} of {run.first['steps']}  {name:<12} {took_s:6.1f} s{paused}{details}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
             changes = step.set_point_nm != before_nm

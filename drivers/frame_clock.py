@@ -111,14 +111,17 @@ class FrameClock:
 
     def _has_paused(self, earliest_ns: int, found_ns: int, steps: int) -> bool:
         """Return whether the board stopped before a frame, which came at `earliest_ns` at the earliest."""
-        unnoticed = LATE_NS / self._exact_period_ns
-        late, before = self._periods_to(found_ns) - steps, self._lateness[-1]
+        # All times here are in periods. A busy computer delays a frame by up to `largest_delay`.
+        largest_delay = LATE_NS / self._exact_period_ns
+        if self._periods_to(earliest_ns) > max(self._longest_gap, largest_delay):
+            return True
+        lateness, lateness_before = self._periods_to(found_ns) - steps, self._lateness[-1]
+        two_are_late = min(lateness, lateness_before) > max(0.5, largest_delay)
         # Frames that waited come in a burst, each less late than the one before.
-        long = min(late, before) > max(0.5, unnoticed) and late > before - 0.5
-        row = [*self._lateness, late]
-        same = max(row) - min(row) < SAME_LATENESS and min(row) > MIN_LATENESS
-        short = len(row) == EQUALLY_LATE and same
-        return long or short or self._periods_to(earliest_ns) > max(self._longest_gap, unnoticed)
+        in_burst = lateness <= lateness_before - 0.5
+        latest = [*self._lateness, lateness]
+        equally_late = max(latest) - min(latest) < SAME_LATENESS and min(latest) > MIN_LATENESS
+        return (two_are_late and not in_burst) or (len(latest) == EQUALLY_LATE and equally_late)
 
     def _take(self, arrival_ns: int) -> None:
         """Take a frame that shows the board's phase and period."""

@@ -4,7 +4,6 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.faults import Fault, FaultCode
@@ -208,7 +207,8 @@ def _late(source: TorqueSource, what: str, came_s: float, measured_s: float) -> 
     )
 
 
-class _Comparison(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class _Comparison:
     """The torques of two sources at one time, the slower source's first."""
 
     slow: TorqueSource
@@ -219,19 +219,19 @@ class _Comparison(NamedTuple):
 
     def disagreement(self, inputs: LatestInputs, config: LoopConfig) -> list[Fault]:
         """Return the fault of two torques that are too far apart; none where they agree."""
-        slow, fast, slow_nm, fast_nm, t_ns = self
-        apart_nm = abs(fast.as_read_nm(slow_nm) - slow.as_read_nm(fast_nm))
+        slow, fast = self.slow, self.fast
+        apart_nm = abs(fast.as_read_nm(self.slow_nm) - slow.as_read_nm(self.fast_nm))
         allowed_nm = config.disagreement_nm + slow.noise_nm + fast.noise_nm
         if apart_nm <= allowed_nm:
             return []
         apart = (
-            f"{slow.name} measured {slow_nm:+.3f} N·m and {fast.name} {fast_nm:+.3f} N·m, "
+            f"{slow.name} measured {self.slow_nm:+.3f} N·m and {fast.name} {self.fast_nm:+.3f} N·m, "
             f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
         )
         # A torque on another tool than the calibrated one may be off by any factor.
         latest = (inputs.torques.get(source.name) for source in (slow, fast))
         notes = [one.note for one in latest if one is not None and one.note]
-        return [Fault(FaultCode.TORQUES_DISAGREE, "; ".join((apart, *notes)), t_ns=t_ns)]
+        return [Fault(FaultCode.TORQUES_DISAGREE, "; ".join((apart, *notes)), t_ns=self.t_ns)]
 
 
 def _latest_comparison(

@@ -154,8 +154,8 @@ class SafetyMonitor:
         """The faults of the stop that waits, its cause first, and the present ones that refuse a start."""
         if self.waiting is None or self._active is None:
             return self.waiting.faults if self.waiting is not None else ()
-        told = self._with_stop(self.waiting, self._active).reported
-        return (*told[:1], *(fault for fault in told[1:] if fault.rule.response >= Response.REFUSE_START))
+        reported = self._with_stop(self.waiting, self._active).reported
+        return (*reported[:1], *(fault for fault in reported[1:] if fault.rule.response >= Response.REFUSE_START))
 
     @property
     def stop_number(self) -> int:
@@ -173,20 +173,19 @@ class SafetyMonitor:
     @classmethod
     def _with_stop(cls, stop: Stop, active: tuple[Fault, ...]) -> SafetyDecision:
         """Return the stop's faults, updated with the present ones."""
-        codes = {fault.code for fault in active}
+        active_codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.
-        known = {fault.code for fault in stop.faults}
+        stop_codes = list(dict.fromkeys(fault.code for fault in stop.faults))
         # What a present fault of a device hides comes after it, as what it makes the robot refuse; else it is over.
-        of_device = bool(codes & _OF_DEVICES)
-        over = set() if of_device else _SHOWN_AT_REST
-        hidden = (_SHOWN_AT_REST - codes) | {FaultCode.COMMAND_REFUSED} if of_device else set()
-        kept = [replace(one, is_over=one.code in over) for one in stop.faults if one.code not in codes]
-        kept += [fault for fault in active if fault.code in known]
-        order = list(dict.fromkeys(fault.code for fault in stop.faults))
-        kept.sort(key=lambda fault: order.index(fault.code))
-        new = (fault for fault in active if fault.code not in known)
-        told = sorted((*kept, *new), key=lambda fault: fault.code in hidden)
-        return SafetyDecision(stop.response, cls._explained(tuple(told), _explaining(stop.faults)))
+        of_device = bool(active_codes & _OF_DEVICES)
+        over_codes = set() if of_device else _SHOWN_AT_REST
+        hidden_codes = (_SHOWN_AT_REST - active_codes) | {FaultCode.COMMAND_REFUSED} if of_device else set()
+        kept = [replace(one, is_over=one.code in over_codes) for one in stop.faults if one.code not in active_codes]
+        kept += [fault for fault in active if fault.code in stop_codes]
+        kept.sort(key=lambda fault: stop_codes.index(fault.code))
+        new = (fault for fault in active if fault.code not in stop_codes)
+        reported = sorted((*kept, *new), key=lambda fault: fault.code in hidden_codes)
+        return SafetyDecision(stop.response, cls._explained(tuple(reported), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:
         """Advance the hold timers to t_ns: up for faults that lasted until now, down for the others."""

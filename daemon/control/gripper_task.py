@@ -128,7 +128,7 @@ class GripperTask:
         may_hold = state.object is not ObjectStatus.AT_TARGET or self._unfelt(state)
         # In counts: the fingers may stand less than one count from the target.
         opens = self.gripper.calibration.counts(target.width_mm) < state.position_counts
-        if opens and may_hold and not self._nearly_open(state):
+        if opens and may_hold and (self._holds(state) or not self._nearly_open(state)):
             # Fingers that another program moves have to be halted.
             refused = ActionError if state.object is ObjectStatus.MOVING else NotBegunError
             raise refused(

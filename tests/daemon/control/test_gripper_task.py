@@ -199,6 +199,19 @@ async def test_a_grip_does_not_activate_a_gripper_that_lost_its_power_with_a_too
 
 
 @WAYS
+async def test_a_grip_does_not_open_a_held_tool_that_is_nearly_as_wide_as_the_stroke(way, tmp_path):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task = task_of(rig)
+        await task.release()
+        rig.model.object_mm = 134.0
+        await task.grip(GRIP)
+        held_mm = rig.model.width_mm
+        with pytest.raises(NotBegunError, match="would open them and drop it"):
+            await task.grip(GRIP.model_copy(update={"width_mm": 138.0}))
+        assert rig.model.width_mm == held_mm
+
+
+@WAYS
 @pytest.mark.parametrize("beyond_mm", [-5.0, 1.0])
 async def test_a_release_of_a_known_grip_opens_fully_after_a_new_connection(way, tmp_path, beyond_mm):
     """The tool is as wide as the grip's target, so that the gripper does not feel it."""

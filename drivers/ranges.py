@@ -18,6 +18,8 @@ LARGEST_MARGIN_RAD = 1.0
 # ur-rtde refuses a faster command, which would end the worker (rtde_control_interface.h: UR_JOINT_VELOCITY_MAX and its
 # neighbours). A stop brakes up to the hard limit of acceleration.
 LARGEST_WRIST_SPEED_RAD_PER_S, _LARGEST_ANGULAR_ACCELERATION, _LARGEST_SPEED_M_PER_S = 3.14, 40.0, 3.0
+# Of the largest UR arm.
+LARGEST_PAYLOAD_KG = 35.0
 # The torque on a tool that the skins and fingertips can bear.
 LARGEST_TORQUE_NM = 5.0
 
@@ -39,8 +41,7 @@ Acceleration = Annotated[float, _range("m/s²", gt=0, le=20)]
 # The force and the torque at the tool's centre that the arm's own safety functions allow at most.
 ToolForce = Annotated[float, _range("N", gt=0, le=250)]
 ToolTorque = Annotated[float, _range("N·m", gt=0, le=60)]
-# The largest UR arm carries 35 kg.
-Payload = Annotated[float, _range("kg", ge=0, le=35)]
+Payload = Annotated[float, _range("kg", ge=0, le=LARGEST_PAYLOAD_KG)]
 TorqueSetPoint = Annotated[float, _range("N·m", ge=-LARGEST_TORQUE_NM, le=LARGEST_TORQUE_NM)]
 TorqueLimit = Annotated[float, _range("N·m", gt=0, le=LARGEST_TORQUE_NM)]
 Seconds = Annotated[float, _range("s", ge=0, le=24 * 3600)]

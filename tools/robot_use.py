@@ -1,6 +1,7 @@
 """Which other programs use a robot, as its controller reports: also those of other users and other computers."""
 
 import re
+from collections.abc import Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from enum import Enum, auto
@@ -14,9 +15,15 @@ from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.script import FIRST_WITH_LOWER_ALONE, LOWER, UPPER, ScriptRegisters
 from shearloop.errors import UserError
 
-# The rated payloads in kg of UR's data sheets, by PolyScope's major version and the dashboard's model. A UR10e of an
-# earlier year is rated 10 kg.
-_RATED_KG: Final = {3: {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}, 5: {"UR3": 3.0, "UR5": 5.0, "UR10": 12.5, "UR16": 16.0}}
+# A controller that is there answers within it.
+ROBOT_TIMEOUT_S: Final = 2.0
+# The rated payloads in kg of UR's data sheets, by PolyScope's major version and the dashboard's model. A model that was
+# sold with several has them all, the smallest one first: no controller says which one its arm has.
+_RATED_KG: Final[Mapping[int, Mapping[str, tuple[float, ...]]]] = {
+    3: {"UR3": (3.0,), "UR5": (5.0,), "UR10": (10.0,)},
+    5: {"UR3": (3.0,), "UR5": (5.0,), "UR10": (10.0, 12.5), "UR16": (16.0,)},
+}
+SMALLEST_ARM_KG: Final = min(rated_kg[0] for models in _RATED_KG.values() for rated_kg in models.values())
 # RTDE's slowest rate that every controller has; one state is enough.
 _ONE_STATE_HZ = 125.0
 
@@ -27,21 +34,46 @@ def read_outputs(host: str, timeout_s: float, registers: ScriptRegisters = UPPER
         return receiver.latest()
 
 
-def read_rated_kg(host: str, timeout_s: float, major: int) -> tuple[str, float | None]:
-    """Return an arm's model and its rated payload in kg; None for a model that is not known, or not reported.
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """An arm's model, and the payloads in kg that it may be rated for, the smallest one first.
 
-    `major` is PolyScope's major version. DriverError where the dashboard server does not answer.
+    Both are empty for a model that is not known, or not reported.
+    """
+
+    model: str = ""
+    rated_kg: tuple[float, ...] = ()
+
+    @property
+    def rated(self) -> str:
+        """The rated payload in words."""
+        return f"{' or '.join(f'{kg:g}' for kg in self.rated_kg)} kg"
+
+    def is_beyond(self, payload_kg: float | None) -> bool:
+        """Return whether no arm of this model may carry a payload; NaN is a payload that is not known."""
+        return payload_kg is not None and bool(self.rated_kg) and payload_kg > self.rated_kg[-1]
+
+    def may_be_beyond(self, payload_kg: float | None) -> bool:
+        """Return whether some arms of this model may not carry a payload, and others may."""
+        if payload_kg is None or not self.rated_kg:
+            return False
+        return self.rated_kg[0] < payload_kg <= self.rated_kg[-1]
+
+
+UNKNOWN_ARM: Final = Arm()
+
+
+def read_arm(host: str, timeout_s: float, major: int) -> Arm:
+    """Return which arm a controller has; `major` is PolyScope's major version.
+
+    DriverError where the dashboard server does not answer.
     """
     (answer,) = ask_dashboard(host, timeout_s, ("get robot model",))
-    model = re.fullmatch(r"(UR\d+)e?", answer.strip())
-    return (model[1], _RATED_KG.get(major, {}).get(model[1])) if model is not None else ("", None)
-
-
-def beyond_rated(payload_kg: float | None, model: str, rated_kg: float | None) -> str:
-    """Return that a payload is beyond the arm's rated one, or an empty string; NaN is a payload that is not known."""
-    if payload_kg is None or rated_kg is None or not payload_kg > rated_kg:
-        return ""
-    return f"{payload_kg:g} kg is above the rated payload of this {model}, {rated_kg:g} kg"
+    match = re.fullmatch(r"(UR\d+)e?", answer.strip())
+    if match is None:
+        return UNKNOWN_ARM
+    model = match[1]
+    return Arm(model, _RATED_KG.get(major, {}).get(model, ()))
 
 
 class Registers(Enum):

@@ -16,9 +16,6 @@ from shearloop.drivers.robotiq.models import MODELS
 from shearloop.errors import UserError
 from shearloop.words import counted
 
-# A controller that is there answers within it.
-CONTROLLER_TIMEOUT_S = 2.0
-
 if TYPE_CHECKING:
     from shearloop.daemon.rig_memory import Remembered
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -56,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.drivers.robotiq.socket_client import SocketClient
     from shearloop.drivers.robotiq.width_fit import fit_width
     from shearloop.drivers.robotiq.widths import WidthCalibration
-    from shearloop.tools.robot_use import refuse_used_robot
+    from shearloop.tools.robot_use import ROBOT_TIMEOUT_S, refuse_used_robot
 
     if len(set(args.diameter_mm)) < 2:
         raise UserError("give at least two different --diameter-mm")
@@ -69,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         if args.host is not None:
             # The URCap's socket serves a daemon at the same time; a serial port has one program.
             opened.enter_context(lock_gripper(args.host, args.socket_port))
-            refuse_used_robot(args.host, CONTROLLER_TIMEOUT_S)
+            refuse_used_robot(args.host, ROBOT_TIMEOUT_S)
             left = read_memories(RobotFiles(args.host))
             client = SocketClient(args.host, args.socket_port)
         else:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
+from shearloop.drivers.ranges import LARGEST_PAYLOAD_KG
 from shearloop.drivers.ur.control_box import ControllerInfo, untested
 from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_sentence, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
@@ -12,8 +13,7 @@ from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
-from shearloop.tools.commission.wrench import HEAVIEST_KG
-from shearloop.tools.robot_use import Registers, beyond_rated, program_in_words, used_registers
+from shearloop.tools.robot_use import UNKNOWN_ARM, Arm, Registers, program_in_words, used_registers
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"
@@ -36,8 +36,7 @@ class Identity:
     outputs: RtdeOutputs
     safety_checksum: str
     typed_kg: tuple[float, float] | None = None
-    # The arm's model and its rated payload, None where it is not known.
-    rated: tuple[str, float | None] = ("", None)
+    arm: Arm = UNKNOWN_ARM
 
 
 def measure(context: Context) -> Measured:
@@ -48,9 +47,9 @@ def measure(context: Context) -> Measured:
     checksum = context.operator.ask(CHECKSUM_QUESTION, Played(f"the pendant shows {EMULATED_CHECKSUM}"))
     typed_kg = None
     if math.isnan(outputs.payload_kg) and context.settings.tool.payload_kg is None:
-        shown_kg = context.operator.number(SHOWN_QUESTION, 0.0, HEAVIEST_KG)
-        typed_kg = shown_kg, context.operator.number(MOUNTED_QUESTION, 0.0, HEAVIEST_KG)
-    found = Identity(context.controller, outputs, checksum, typed_kg, context.rig.rated())
+        shown_kg = context.operator.number(SHOWN_QUESTION, 0.0, LARGEST_PAYLOAD_KG)
+        typed_kg = shown_kg, context.operator.number(MOUNTED_QUESTION, 0.0, LARGEST_PAYLOAD_KG)
+    found = Identity(context.controller, outputs, checksum, typed_kg, context.rig.arm())
     return Measured(judge_identity(found, context.settings, context.config))
 
 
@@ -133,13 +132,18 @@ def _payload(identity: Identity, wanted_kg: float | None, *, emulated: bool) -> 
 
 def _rated(identity: Identity, wanted_kg: float | None) -> list[Line]:
     """Return the line on the arm's rated payload, or none where the arm's model is not known."""
-    (model, rated_kg), typed_kg = identity.rated, identity.typed_kg or ()
-    if rated_kg is None:
+    arm, typed_kg = identity.arm, identity.typed_kg or ()
+    if not arm.rated_kg:
         return []
-    given = (identity.outputs.payload_kg, wanted_kg, *typed_kg)
-    beyond = next(filter(None, (beyond_rated(kg, model, rated_kg) for kg in given)), "")
-    limit = f"at most {rated_kg:g} kg, the rated payload of a {model}"
-    return [judged("rated payload", beyond or "not exceeded", limit, "the arm can hold its load", passed=not beyond)]
+    given_kg = (identity.outputs.payload_kg, wanted_kg, *typed_kg)
+    beyond_kg = next(filter(arm.is_beyond, given_kg), None)
+    unsure_kg = next(filter(arm.may_be_beyond, given_kg), None)
+    what, limit = "rated payload", f"at most {arm.rated}, the rated payload of a {arm.model}"
+    if beyond_kg is None and unsure_kg is not None:
+        value = f"{unsure_kg:g} kg: read on the arm's type plate whether it is rated for it"
+        return [Line(what=what, value=value, limit=limit)]
+    value = "not exceeded" if beyond_kg is None else f"{beyond_kg:g} kg"
+    return [judged(what, value, limit, "the arm can hold its load", passed=beyond_kg is None)]
 
 
 def _unreported_payload(typed_kg: tuple[float, float] | None, wanted_kg: float | None, promise: str) -> Line:

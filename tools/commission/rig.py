@@ -29,7 +29,7 @@ from shearloop.tools.commission.mover import Mover, MoverProcess
 from shearloop.tools.commission.observer import Observer
 from shearloop.tools.commission.observer_process import ObserverProcess
 from shearloop.tools.fingertip_table import fingertip_table
-from shearloop.tools.robot_use import read_outputs, read_rated_kg
+from shearloop.tools.robot_use import Arm, read_arm, read_outputs
 
 
 class Rig(Protocol):
@@ -43,8 +43,8 @@ class Rig(Protocol):
     def outputs(self, registers: ScriptRegisters) -> RtdeOutputs:
         """Return the controller's present outputs."""
 
-    def rated(self) -> tuple[str, float | None]:
-        """Return the arm's model and its rated payload in kg, None where it is not known."""
+    def arm(self) -> Arm:
+        """Return the arm's model and its rated payload."""
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""
@@ -88,10 +88,10 @@ class ConnectedRig:
         """Return the controller's present outputs; raises RobotLostError if it does not answer."""
         return read_outputs(self._settings.host, self._settings.connect_timeout_s, registers)
 
-    def rated(self) -> tuple[str, float | None]:
-        """Return the arm's model and its rated payload in kg, None where it is not known."""
+    def arm(self) -> Arm:
+        """Return the arm's model and its rated payload."""
         settings = self._settings
-        return read_rated_kg(settings.host, settings.connect_timeout_s, settings.facts.major)
+        return read_arm(settings.host, settings.connect_timeout_s, settings.facts.major)
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""

@@ -9,6 +9,7 @@ from typing import Final
 from scipy import constants
 
 from shearloop.daemon.commissioning_report import Line
+from shearloop.drivers.ranges import LARGEST_PAYLOAD_KG
 from shearloop.drivers.ur.settings import Six, UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S
@@ -17,15 +18,12 @@ from shearloop.tools.commission.motion import SPEED_RAD_PER_S, TURN_RAD
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
+from shearloop.tools.robot_use import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm
 
 STAGE: Final = "5 wrench"
 SIGMAS: Final = 5.0
 MASS_TOLERANCE: Final = 0.1
 LARGEST_KG: Final = 5.0
-# The rated payload of a UR3.
-_SMALLEST_ARM_KG: Final = 3.0
-# Of all arms.
-HEAVIEST_KG: Final = 35.0
 _READ_S: Final = 2.0
 
 
@@ -148,11 +146,11 @@ def hung_mass(context: Context) -> Line:
     if payload_kg is None:
         payload_kg = context.observer.latest().outputs.payload_kg
     if math.isnan(payload_kg):
-        payload_kg = context.operator.number("The payload in kg that is set at the pendant", 0.0, HEAVIEST_KG)
-    model, rated_kg = context.rig.rated()
-    if rated_kg is None and context.config.emulated:
-        model, rated_kg = "emulated arm", HEAVIEST_KG
-    largest_kg, because = largest_mass_kg(settings, payload_kg, model, rated_kg)
+        payload_kg = context.operator.number("The payload in kg that is set at the pendant", 0.0, LARGEST_PAYLOAD_KG)
+    arm = context.rig.arm()
+    if not arm.rated_kg and context.config.emulated:
+        arm = Arm("emulated arm", (LARGEST_PAYLOAD_KG,))
+    largest_kg, because = largest_mass_kg(settings, payload_kg, arm)
     if largest_kg < least_kg:
         value = (
             f"not measured: the wrench shows masses from {least_kg:g} kg on, and at most {largest_kg:g} kg may hang: "
@@ -170,19 +168,22 @@ def hung_mass(context: Context) -> Line:
     return judge_mass(before, after, kg, settings)
 
 
-def largest_mass_kg(
-    settings: UrSettings, payload_kg: float, model: str = "", rated_kg: float | None = None
-) -> tuple[float, str]:
+def largest_mass_kg(settings: UrSettings, payload_kg: float, arm: Arm = UNKNOWN_ARM) -> tuple[float, str]:
     """Return the largest mass that may hang on the tool in addition to its payload, and its bound in words.
 
-    An arm of an unknown model counts as the smallest one. The weight stays below the limit at which the arm stops.
+    An arm counts as the smallest one of its model, and as the smallest of all where its model is not known. The weight
+    stays below the limit at which the arm stops.
     """
-    arm = f"this {model} is rated for" if rated_kg is not None else "an arm of unknown model may be rated for"
-    rated_kg = _SMALLEST_ARM_KG if rated_kg is None else rated_kg
+    if not arm.rated_kg:
+        rated_kg, rated = SMALLEST_ARM_KG, "an arm of unknown model may be rated for"
+    elif len(arm.rated_kg) == 1:
+        rated_kg, rated = arm.rated_kg[0], f"this {arm.model} is rated for"
+    else:
+        rated_kg, rated = arm.rated_kg[0], f"a {arm.model} of an earlier year is rated for"
     stops_n = settings.limits.force_n.hard
     bounds = [
         (LARGEST_KG, f"at most {LARGEST_KG:g} kg is needed"),
-        (rated_kg - payload_kg, f"{arm} {rated_kg:g} kg, and its payload is {payload_kg:g} kg"),
+        (rated_kg - payload_kg, f"{rated} {rated_kg:g} kg, and its payload is {payload_kg:g} kg"),
         ((stops_n - settings.facts.noise_n) / constants.g, f"limits.force_n.hard stops the arm at {stops_n:g} N"),
     ]
     largest_kg, because = min(bounds)

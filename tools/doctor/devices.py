@@ -42,10 +42,9 @@ from shearloop.tools.doctor.boards import (
     table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
-from shearloop.tools.robot_use import Registers, beyond_rated, read_outputs, read_rated_kg, used_registers
+from shearloop.tools.robot_use import ROBOT_TIMEOUT_S, Arm, Registers, read_arm, read_outputs, used_registers
 from shearloop.tools.task_row import task_row
 
-ROBOT_TIMEOUT_S = 2.0
 DAEMON_TIMEOUT_S = 1.0
 # What a daemon's rig is compared by, beside its devices, with the keys in the configuration.
 _COMPARED = {"rig": "name", "emulated": "emulated", "publish": "publish"}
@@ -165,7 +164,7 @@ def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Findi
     host, means = settings.host, "the daemon refuses every motion"
     try:
         outputs = read_outputs(host, ROBOT_TIMEOUT_S, seen.registers or UPPER)
-        model, rated_kg = read_rated_kg(host, ROBOT_TIMEOUT_S, settings.facts.major)
+        arm = read_arm(host, ROBOT_TIMEOUT_S, settings.facts.major)
     except DriverError as error:
         cure = "look at the teach pendant, and run the doctor again"
         yield from_error("robot's state", error, "slider, payload and tool are not known", cure)
@@ -176,19 +175,32 @@ def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Findi
         yield trouble("speed slider", what, means, cure.rstrip("."))
     else:
         yield good("speed slider", f"{outputs.speed_slider:.0%}")
-    for payload_kg in (outputs.payload_kg, settings.tool.payload_kg):
-        if not differs and (beyond := beyond_rated(payload_kg, model, rated_kg)):
-            cure = "mount less, and correct `tool.payload_kg` and the pendant"
-            yield trouble("payload", beyond, "the arm cannot hold it safely", cure)
-            return
     if differs:
         what, _, cure = differs.partition(": ")
         yield trouble("payload and tool", what, means, cure.rstrip("."))
+        return
+    unsafe = check_payload(arm, outputs.payload_kg, settings.tool.payload_kg)
+    if unsafe is not None:
+        yield unsafe
     elif settings.tool.absent and settings.tool.reported:
         # The findings on the robot's settings name what is absent.
         return
     else:
         yield good("payload and tool", "as in the robot's settings")
+
+
+def check_payload(arm: Arm, *payloads_kg: float | None) -> Finding | None:
+    """Return the finding on a payload that the arm is not rated for, or may not be, or None."""
+    for payload_kg in (kg for kg in payloads_kg if kg is not None):
+        if arm.is_beyond(payload_kg):
+            found = f"{payload_kg:g} kg is above the rated payload of this {arm.model}, {arm.rated}"
+            cure = "mount less, and correct `tool.payload_kg` and the pendant"
+            return trouble("payload", found, "the arm cannot hold it safely", cure)
+        if arm.may_be_beyond(payload_kg):
+            found = f"{payload_kg:g} kg is mounted, and a {arm.model} is rated for {arm.rated}"
+            cure = "read the arm's type plate, and mount less if it says less"
+            return note("payload", found, "an arm of an earlier year cannot hold it safely", cure)
+    return None
 
 
 def check_identity(config: DaemonConfig, settings: UrSettings, version: str, serial_number: str) -> Iterator[Finding]:

@@ -50,6 +50,7 @@ from shearloop.tools.commission.mover_process import CAUSES, WORKERS, Driver
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from shearloop.tools.fingertip_table import fingertip_table
+from shearloop.tools.robot_use import Arm
 from tests.drivers.ur import robots
 from tests.drivers.ur.scripted_arm import ScriptedArm
 
@@ -442,8 +443,8 @@ class SimulatedRig:
             tcp_offset=robot.spec.tcp_offset,
         )
 
-    def rated(self) -> tuple[str, float | None]:
-        return "UR5", 5.0
+    def arm(self) -> Arm:
+        return Arm("UR5", (5.0,))
 
     def write_register(self, _registers: ScriptRegisters, value: int) -> int:
         return value

@@ -31,6 +31,7 @@ from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
 from shearloop.tools.commission.operator import DeclinedError, Operator
 from shearloop.tools.commission.report import earlier_report, report_for, save_report, with_stage
+from shearloop.tools.robot_use import UNKNOWN_ARM, Arm
 from tests.emulator_process import EmulatorProcess
 from tests.fixtures.robots import TOOL, write_filled_in
 
@@ -73,8 +74,9 @@ def write_rig(folder: Path, host: str = "192.168.1.10") -> Path:
         (seen(registers=None), ["registers"]),
         (replace(GOOD, safety_checksum=""), ["safety checksum"]),
         (replace(GOOD, outputs=replace(OUTPUTS, speed_slider=0.5)), ["speed slider"]),
-        (replace(GOOD, rated=("UR5", 5.0)), []),
-        (replace(GOOD, rated=("UR1", 1.0)), ["rated payload"]),
+        (replace(GOOD, arm=Arm("UR5", (5.0,))), []),
+        (replace(GOOD, arm=Arm("UR1", (1.0,))), ["rated payload"]),
+        (replace(GOOD, arm=Arm("UR2", (1.0, 2.0))), []),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.409)), []),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=1.42)), ["payload"]),
         (replace(GOOD, outputs=replace(OUTPUTS, payload_kg=math.nan)), ["payload"]),
@@ -85,6 +87,15 @@ def test_a_fault_fails_exactly_its_own_line(tmp_path, found, failed):
     lines = judge_identity(found, read_settings(config.robot), config)
     assert [line.what for line in lines if line.verdict == "failed"] == failed
     assert "7583" in [line.value for line in lines]
+
+
+def test_a_payload_that_only_newer_arms_of_the_model_carry_is_no_pass(tmp_path):
+    """No controller says of which year its arm is."""
+    config = load_daemon_config(write_rig(tmp_path))
+    found = replace(GOOD, arm=Arm("UR2", (1.0, 2.0)))
+    (line,) = (one for one in judge_identity(found, read_settings(config.robot), config) if one.what == "rated payload")
+    assert (line.verdict, line.limit) == ("noted", "at most 1 or 2 kg, the rated payload of a UR2")
+    assert "type plate" in line.value
 
 
 @pytest.mark.parametrize(
@@ -126,7 +137,7 @@ def stage_0(tmp_path: Path, answers: list[str], version: str, tool: InstalledToo
         asked.append(question)
         return answers.pop(0)
 
-    rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed), rated=lambda: ("", None))
+    rig = SimpleNamespace(outputs=lambda _: replace(OUTPUTS, **changed), arm=lambda: UNKNOWN_ARM)
     settings, controller = replace(read_settings(config.robot), tool=tool), replace(CONTROLLER, version=version)
     operator = Operator(answer, lambda _: None, allows=True)
     measured = identity.measure(Context(config, settings, rig, controller, operator, None, Counts(), ExitStack()))

@@ -52,6 +52,7 @@ from shearloop.tools.commission.wrench import (
     largest_mass_kg,
     least_mass_kg,
 )
+from shearloop.tools.robot_use import Arm
 from tests.drivers.ur.robots import DELIVERED
 from tests.emulators.test_cb3 import SETTINGS as CB3
 
@@ -234,23 +235,28 @@ def test_a_hung_mass_is_weighed(force_n, lines):
 
 def test_a_mass_that_is_hung_is_bounded_by_the_arm_and_by_the_limit_that_stops_it():
     careful = dataclasses.replace(DELIVERED.limits, force_n=ForceBound(20.0, 30.0))
-    largest_kg, because = largest_mass_kg(dataclasses.replace(DELIVERED, limits=careful), 1.0, "UR5", 5.0)
+    largest_kg, because = largest_mass_kg(dataclasses.replace(DELIVERED, limits=careful), 1.0, Arm("UR5", (5.0,)))
     assert largest_kg == pytest.approx((30.0 - 3.5) / 9.81, abs=0.1)
     assert "limits.force_n.hard stops the arm at 30 N" in because
-    assert largest_mass_kg(DELIVERED, 4.5, "UR5", 5.0) == (0.5, "this UR5 is rated for 5 kg, and its payload is 4.5 kg")
+    assert largest_mass_kg(DELIVERED, 4.5, Arm("UR5", (5.0,))) == (
+        0.5,
+        "this UR5 is rated for 5 kg, and its payload is 4.5 kg",
+    )
     wide = dataclasses.replace(CB3.limits, force_n=ForceBound(120.0, 150.0))
     settings = dataclasses.replace(CB3, limits=wide)
-    assert largest_mass_kg(settings, 1.0, "UR10", 10.0)[0] == LARGEST_KG
-    assert largest_mass_kg(settings, 1.0, "UR3", 3.0)[0] == 2.0, "less than a CB3 shows"
+    assert largest_mass_kg(settings, 1.0, Arm("UR10", (10.0,)))[0] == LARGEST_KG
+    assert largest_mass_kg(settings, 1.0, Arm("UR3", (3.0,)))[0] == 2.0, "less than a CB3 shows"
     assert largest_mass_kg(settings, 2.5)[0] == 0.5, "an unknown arm may be the smallest one"
-    assert largest_mass_kg(settings, 4.0, "UR3", 3.0)[0] == 0.0
+    assert largest_mass_kg(settings, 4.0, Arm("UR3", (3.0,)))[0] == 0.0
+    newer_kg, because = largest_mass_kg(settings, 9.0, Arm("UR10", (10.0, 12.5)))
+    assert (newer_kg, because.partition(",")[0]) == (1.0, "a UR10 of an earlier year is rated for 10 kg")
 
 
 def test_a_stage_without_a_mass_that_may_hang_says_what_stays_unmeasured():
     context: Any = SimpleNamespace(
         settings=dataclasses.replace(CB3, tool=InstalledTool(payload_kg=1.25)),
         config=SimpleNamespace(emulated=False),
-        rig=SimpleNamespace(rated=lambda: ("UR3", 3.0)),
+        rig=SimpleNamespace(arm=lambda: Arm("UR3", (3.0,))),
     )
     line = wrench.hung_mass(context)
     assert (line.verdict, "at most 1.7 kg may hang" in line.value) == ("noted", True)

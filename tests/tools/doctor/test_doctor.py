@@ -25,6 +25,7 @@ from shearloop.tools.doctor import devices
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
+from shearloop.tools.robot_use import Arm
 from shearloop.tools.serial_ports import HiddenBoard, SerialPortInfo, access_cure, has_brltty, list_hidden_boards
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop
@@ -100,6 +101,15 @@ async def test_a_model_that_no_measured_width_confirms_is_named(rig_config, cali
     if not calibrated:
         assert found["gripper's model"].found == "a 2F-140, by the configuration alone"
         assert "type plate" in found["gripper's model"].next_step
+
+
+@pytest.mark.parametrize(
+    ("payloads_kg", "state"), [((9.0, 9.0), None), ((11.0, 11.0), "note"), ((13.0, 13.0), "trouble")]
+)
+def test_a_payload_is_judged_by_the_arms_that_a_model_may_be(payloads_kg, state):
+    found = devices.check_payload(Arm("UR10", (10.0, 12.5)), *payloads_kg)
+    assert (found.state if found is not None else None) == state
+    assert state != "note" or "type plate" in found.next_step
 
 
 async def test_a_daemon_that_hangs_is_not_taken_for_none(rig_config, monkeypatch):

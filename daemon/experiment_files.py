@@ -22,7 +22,6 @@ from typing import NamedTuple, TypeVar
 import structlog
 
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.control.experiment_check import experiment_mistakes
 from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -59,7 +58,16 @@ def check_experiment(
     if path is None:
         return None
     document = read_document(path)
-    return without_mistakes(document, experiment_mistakes(document.content, config, sources, robot))
+    return without_mistakes(document, _mistakes_in(document, config, sources, robot))
+
+
+def _mistakes_in(
+    document: Document, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None
+) -> Sequence[Mistake]:
+    # Only an experiment that is read needs it.
+    from shearloop.daemon.control.experiment_check import experiment_mistakes
+
+    return experiment_mistakes(document.content, config, sources, robot)
 
 
 def read_document(path: Path) -> Document:
@@ -239,7 +247,7 @@ class ExperimentFiles:
 
     def _mistakes(self, document: Document) -> Sequence[Mistake]:
         """Return what the experiment's own limits, or the rig, do not allow."""
-        return experiment_mistakes(document.content, self.config, self.sources, self.robot)
+        return _mistakes_in(document, self.config, self.sources, self.robot)
 
     def _meant(self, named: Path) -> str:
         """Return which file of the folders was probably meant, or an empty text."""

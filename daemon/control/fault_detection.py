@@ -179,21 +179,23 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | 
     if source.name in inputs.lost:
         gone = "not connected yet" if latest is None else "gone"
         return Fault(FaultCode.SENSOR_LOST, f"{source.name} is {gone}: {inputs.lost[source.name]}")
-    no_torque = inputs.arm.no_torque if source.from_robot and inputs.arm is not None else ""
-    why = f": {no_torque}" if no_torque else ""
+    too_few = inputs.arm.no_torque if source.from_robot and inputs.arm is not None else ""
     if latest is None:
-        return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet{why}")
+        silent = Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
+        return Fault(FaultCode.WRENCH_UNKNOWN, too_few) if too_few else silent
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     transport_s = measured_s - came_s - source.acquired_s
     if measured_s > source.oldest_s and transport_s > came_s:
         return Fault(FaultCode.ESTIMATE_LATE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
+    is_old = came_s > source.fresh_s or measured_s > source.oldest_s
+    if is_old and too_few:
+        return Fault(FaultCode.WRENCH_UNKNOWN, too_few, t_ns=latest.t_ns)
     if came_s > source.fresh_s:
-        silent = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed{why}"
-        return Fault(FaultCode.ESTIMATE_STALE, silent, t_ns=latest.t_ns)
-    if measured_s > source.oldest_s:
-        late = _late(source, what, came_s, measured_s)
-        return Fault(FaultCode.ESTIMATE_STALE, f"{late}{why}", t_ns=latest.t_mid_ns)
+        old = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed"
+        return Fault(FaultCode.ESTIMATE_STALE, old, t_ns=latest.t_ns)
+    if is_old:
+        return Fault(FaultCode.ESTIMATE_STALE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
     if latest.torque_nm is None and source.measures_torque:
         said = f"{source.name} says: {latest.reason}" if latest.reason else f"{source.name} gives no torque"
         return Fault(FaultCode.ESTIMATE_INVALID, said, t_ns=latest.t_mid_ns)

@@ -142,9 +142,10 @@ def test_a_wrench_whose_torque_does_not_come_with_the_robots_state_holds_the_wri
     for before in ((), (torque(WRENCH, 0.1, came_s=0.2),)):
         for driving, supervising in ((EIT, (LOAD, WRENCH)), (WRENCH, (LOAD,))):
             events = found(*heard, *before, driving=driving, supervising=supervising, arm=arm)
-            assert events.keys() == {FaultCode.ESTIMATE_STALE}
-            assert "wrench" in events[FaultCode.ESTIMATE_STALE]
-            assert "13 states came" in events[FaultCode.ESTIMATE_STALE]
+            assert events.keys() == {FaultCode.WRENCH_UNKNOWN}
+            assert "a torque of its wrench: 13 states came. " in events[FaultCode.WRENCH_UNKNOWN]
+            assert "lower `rate_hz` of the robot's settings" in events[FaultCode.WRENCH_UNKNOWN]
+            assert "cable" not in events[FaultCode.WRENCH_UNKNOWN], "it has none of its own"
 
 
 def test_a_wrench_without_a_state_of_the_robot_is_no_second_fault():

@@ -83,7 +83,7 @@ async def test_states_that_are_too_few_give_no_torque_which_is_said_and_holds_th
         state = states_of(cell)[-1]
         assert (state.wrist_torque_nm, state.wrist_torque_valid) == (None, False)
         assert "12 of the robot's states came in 0.19 s" in state.wrist_torque_reason
-        assert cell.published.faults == [FaultCode.ESTIMATE_STALE.text]
+        assert cell.published.faults == [FaultCode.WRENCH_UNKNOWN.text]
         assert state.wrist_torque_reason in cell.published.reasons
         assert cell.state.wrist_speed_rad_per_s == 0.0
         health = cell.robot.diagnostics()

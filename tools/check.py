@@ -1,7 +1,6 @@
 """Describes each part of a configuration, or its mistake; opens every file that it names."""
 
 import errno
-import math
 import os
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -272,7 +271,7 @@ def _clients(curve: "CurveConfig") -> str:
 
 
 def _skin(config: "SkinConfig") -> str:
-    from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
+    from shearloop.daemon.sensing.skin_estimator import are_exchanged
     from shearloop.daemon.sensing.skin_task import check_circuit, friction_band_n
     from shearloop.estimation.skin.calibration import load_calibration
 
@@ -286,6 +285,7 @@ def _skin(config: "SkinConfig") -> str:
     )
     if side := calibration.missing_side:
         text += f"; it has no {side} shear forces, and measures none"
-    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
+    first_ohm, second_ohm = calibration.rest_ohm
+    if not are_exchanged(calibration.rest_ohm, second_ohm, first_ohm):
         text += "; its gauges are too similar at rest to detect swapped wires: check the sign of a push"
     return text

@@ -3,8 +3,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from shearloop.cli.skin import _table
+from shearloop.daemon.sensing.skin_estimator import are_exchanged
 from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.estimation.skin.membrane import THICK_SECTION, UNSTRETCHED, Membrane
 from shearloop.studies.skin.characterisation import FigureOfMerit, loop, responses
@@ -92,6 +94,19 @@ def test_a_table_of_one_sign_is_said_by_calibrate_and_check(tmp_path, ran):
     checked = ran("check", rig).out
     assert "it has no negative shear forces, and measures none" in " ".join(checked.split())
     assert "N of friction" in " ".join(checked.split())
+
+
+@pytest.mark.parametrize(("ratio", "is_similar"), [(1.009, True), (1.015, False), (1.03, False)])
+def test_check_names_gauges_that_are_too_similar_for_the_daemon_to_find_them_swapped(tmp_path, ran, ratio, is_similar):
+    content = yaml.safe_load(Path("config/calibrations/skin_demo.yaml").read_text())
+    content["rest_ohm"] = [25.0, 25.0 * ratio]
+    (tmp_path / "skin.yaml").write_text(yaml.safe_dump(content))
+    rig = tmp_path / "rig.yaml"
+    instruments = "{source: {serial: {path: a}}, daq: {adc: {device: {path: b}}}, calibration: skin.yaml}"
+    rig.write_text(f"skin: {instruments}\n")
+    checked = " ".join(ran("check", rig).out.split())
+    assert ("its gauges are too similar at rest to detect swapped wires" in checked) is is_similar
+    assert are_exchanged((25.0, 25.0 * ratio), 25.0 * ratio, 25.0) is not is_similar
 
 
 def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path, mistake):

@@ -70,15 +70,6 @@ class FaultCode(Enum):
         timer="torque source",
         by_busy_computer=True,
     )
-    WRENCH_UNKNOWN = Rule(
-        _HOLD,
-        "the robot's states come too rarely for a torque of its wrench: {detail}.",
-        "End other programs on this computer, look at the network, or lower `rate_hz` of the robot's settings. If the "
-        "wrist stopped, send `shearloop command unlock`.",
-        hold_at_most_s=5.0,
-        timer="torque source",
-        by_busy_computer=True,
-    )
     SENSOR_LOST = Rule(
         _HOLD,
         "a sensor is not connected: {detail}.",
@@ -98,6 +89,15 @@ class FaultCode(Enum):
         "`latency_s` of `shearloop listen eit.estimate` is the time that a fingertip's matching takes, with its wait. "
         "End other programs on this computer, or build a bank with fewer cells. If the wrist stopped, send "
         "`shearloop command unlock`.",
+        hold_at_most_s=5.0,
+        timer="torque source",
+        by_busy_computer=True,
+    )
+    WRENCH_UNKNOWN = Rule(
+        _HOLD,
+        "the robot's states come too rarely for a torque of its wrench: {detail}.",
+        "End other programs on this computer, look at the network, or lower `rate_hz` of the robot's settings. If the "
+        "wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
         by_busy_computer=True,

@@ -4,10 +4,10 @@ The report is a record, not a safety function. Only the pendant's safety configu
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Report, Supplied
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import ModelName
@@ -15,6 +15,10 @@ from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
 from shearloop.errors import Hint, UserError
+
+if TYPE_CHECKING:
+    # A rig without a report does not load it.
+    from shearloop.daemon.commissioning_report import Report
 
 BoundT = TypeVar("BoundT", bound=Bound)
 
@@ -81,7 +85,7 @@ class Commissioning:
     """
 
     given: UrSettings
-    report: Report | None
+    report: "Report | None"
     reason: Hint | None = None
     emulated: bool = False
     rehearsed: bool = False

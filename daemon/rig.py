@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Supplied
 from shearloop.daemon.config import DaemonConfig, GripperConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
@@ -30,6 +29,7 @@ from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
 from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
 from shearloop.daemon.supervisor import Supervisor, Task
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.calibration_files import load_device_calibration

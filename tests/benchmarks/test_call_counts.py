@@ -21,6 +21,7 @@ def test_the_daemon_loads_nothing_but_what_runs_on_the_robots_pc():
     assert loaded.lines > 1000
     assert loaded.lines <= MAX_LINES_WITH_ROBOT
     assert [name for name in loaded.modules if "skin" in name] == [], "only a rig with a skin loads its modules"
+    assert "shearloop.daemon.commissioning_report" not in loaded.modules, "only a configured report is read"
     unneeded = [f"shearloop.daemon.{name}" for name in ("recorder", "sensing.snapshots", "sensing.session_inputs")]
     assert set(unneeded).isdisjoint(loaded.modules), "without a recording nothing of the recorder's is loaded"
     assert "shearloop.drivers.ur.receiver" not in loaded.modules, "the worker talks to the control box"

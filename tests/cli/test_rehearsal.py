@@ -14,9 +14,10 @@ from shearloop.cli.emulate.devices import robot_make
 from shearloop.cli.emulator_processes import check_emulators
 from shearloop.cli.init import packaged_files
 from shearloop.cli.rehearsal import rehearsal
-from shearloop.daemon.commissioning_report import Line, Report, StageResult, Supplied
+from shearloop.daemon.commissioning_report import Line, Report, StageResult
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.ur.settings import GENERATIONS, read_settings

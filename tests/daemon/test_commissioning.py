@@ -11,7 +11,7 @@ import yaml
 
 from shearloop.cli import main
 from shearloop.cli.rehearsed_config import RehearsedConfig
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Line, Report, StageResult, Supplied
+from shearloop.daemon.commissioning_report import Line, Report, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -20,6 +20,7 @@ from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report, old_stages
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings

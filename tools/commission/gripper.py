@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Final
 
-from shearloop.daemon.commissioning_report import Line, Supplied
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import GripperConfig
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.robotiq.gripper import ACTIVATION_DEADLINE_NS, PAUSE_NS, RESET_DEADLINE_NS
 from shearloop.drivers.robotiq.messages import GripperState

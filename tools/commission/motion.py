@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from shearloop.daemon.commissioning_report import Line, Supplied
+from shearloop.daemon.commissioning_report import Line
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.ur.limits import ACCELERATION_S
 from shearloop.drivers.ur.settings import MIN_REST_RAD_PER_S
 from shearloop.errors import UserError

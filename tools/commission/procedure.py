@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Report, StageResult
+from shearloop.daemon.commissioning_report import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.motion_cap import why_not_emulated
 from shearloop.daemon.report_validity import old_stages
@@ -15,6 +15,7 @@ from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensing.skin_task import check_circuit
 from shearloop.daemon.sensors import load_cell_calibration
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench

@@ -9,16 +9,9 @@ from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 
-from shearloop.daemon.commissioning_report import (
-    NOTHING_SUPPLIED,
-    Line,
-    Report,
-    RigIdentity,
-    StageResult,
-    Supplied,
-    Verdict,
-)
+from shearloop.daemon.commissioning_report import Line, Report, RigIdentity, StageResult, Verdict
 from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.errors import UserError
 from shearloop.yaml_files import save_yaml
 

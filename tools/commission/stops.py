@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from shearloop.daemon.commissioning_report import Line, Supplied
+from shearloop.daemon.commissioning_report import Line
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.messages import SAFETY_NORMAL, SAFETY_REDUCED
 from shearloop.drivers.ur.poses import tool_axis

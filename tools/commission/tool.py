@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Final, Self
 
-from shearloop.daemon.commissioning_report import Line, Supplied
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.motion_cap import CAPPED_NM
 from shearloop.daemon.rig_identity import source_sha256
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, direction_of
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.ur.poses import tool_axis

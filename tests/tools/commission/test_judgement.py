@@ -12,8 +12,8 @@ import pytest
 import yaml
 
 from shearloop.bank.channels import PAPER_TABLE
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.robotiq.width_fit import fit_width

@@ -11,11 +11,12 @@ import yaml
 
 from benchmarks.stop_times import write_random_bank
 from shearloop.bank.bank_file import Bank
-from shearloop.daemon.commissioning_report import NOTHING_SUPPLIED, Line
+from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.report_validity import load_report
 from shearloop.daemon.rig import open_settings
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
 from shearloop.tools.commission import stops
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts

@@ -83,7 +83,8 @@ export function torquePanel(link) {
   const estimate = link.get("eit.estimate", known[0]);
   const driving = drivingTorque(link);
   markAge(byId("torque"), link, driving?.message);
-  put(byId("torque-source"), driving ? `${driving.name}${named ? ", drives the loop" : ""}` : named ? `${named}, drives the loop` : "torque");
+  const source = driving?.name || named || "torque";
+  put(byId("torque-source"), named ? `${source}, drives the loop` : source);
   const said = driving?.message.content;
   put(byId("torque-now"), driving?.valid ? number(driving.value, 4, link.unit("loop.state", "torque_nm"), SIGNED) : "–");
   put(byId("torque-interval"), driving?.valid && said.torque_low_nm != null ? `${interval(said.torque_low_nm, said.torque_high_nm, 4)} (95 %)` : "");
@@ -156,9 +157,10 @@ export class FingertipPanel {
     put(this.part("sigma"), link.number(estimate, "sigma", 3));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
+    if (estimate && !said.valid) warn(this.part("invalid"), `not valid: ${said.reason}`, link.idle());
     // Only a fingertip with a bank has a heatmap, and only a frame that came late has no match in it.
-    const unmatched = said.valid && said.k == null && heatmap ? UNMATCHED : "";
-    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : unmatched, link.idle() || unmatched !== "");
+    else if (estimate && said.k == null && heatmap) warn(this.part("invalid"), UNMATCHED, true);
+    else warn(this.part("invalid"), "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
     // An empty picture would push all below it off a phone's screen.
     this.part("map").closest("figure").hidden = !heatmap;
@@ -338,7 +340,10 @@ function newChip() {
 function taskOf(name, facts) {
   const dead = facts.alive === false && !facts.done;
   const error = facts.error || facts.last_error || "";
-  const [state, text] = dead ? ["dead", `✗ ${name}: DEAD`] : facts.done ? ["done", `✓ ${name}: done`] : facts.error ? ["warned", `! ${name}: error`] : ["alive", `✓ ${name}`];
+  let [state, text] = ["alive", `✓ ${name}`];
+  if (dead) [state, text] = ["dead", `✗ ${name}: DEAD`];
+  else if (facts.done) [state, text] = ["done", `✓ ${name}: done`];
+  else if (facts.error) [state, text] = ["warned", `! ${name}: error`];
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
   const restarts = facts.restarts ? `restarted ${facts.restarts === 1 ? "once" : `${facts.restarts} times`}` : "";
@@ -391,7 +396,10 @@ export function loopPanel(link) {
   // A person's own stop is no error.
   const asked = stop && codes[0] === link.settings.operator_stop;
   byId("holding").dataset.kind = stop && !asked ? "stop" : "hold";
-  put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (asked ? "Stopped as asked" : stop ? `Stopped: ${current.response}` : "Holding, because"));
+  let title = { note: "Note", "refuse start": "No start" }[current.response] ?? "Holding, because";
+  if (asked) title = "Stopped as asked";
+  else if (stop) title = `Stopped: ${current.response}`;
+  put(byId("holding-title"), title);
   put(byId("cause"), current.cause || reasons);
   put(byId("stop-times"), stopped ? stopTimes(link, current) : "");
   // `reasons` begins with the cause.

@@ -80,6 +80,7 @@ export class Controls {
     this.received = received;
     // An unlock acknowledges the stop that is shown, and no other.
     this.stopShown = loop?.stop;
+    this.followRun();
     this.watch();
   }
 
@@ -129,6 +130,20 @@ export class Controls {
     const paths = offered.map(({ path }) => path);
     picker.value = paths.includes(before) ? before : reply.configured || (paths[0] ?? "");
     show(picker, offered.length > 0);
+    this.followRun();
+  }
+
+  // Pick the experiment of each new run once, whoever started it: after a stop it is the one to start again.
+  followRun() {
+    const { run, experiment } = this.link?.get("loop.state")?.content ?? {};
+    const picker = byId("experiment");
+    const named = [...picker.options].filter((option) => option.text === experiment);
+    // A daemon that was started again counts its runs anew.
+    const seen = `${run} ${experiment}`;
+    if (named.length === 0 || seen === this.followed) return;
+    this.followed = seen;
+    // Two files may have the same name: which of them runs, is not known here.
+    if (named.length === 1) picker.value = named[0].value;
   }
 
   refresh() {
@@ -259,7 +274,8 @@ function refusals(link) {
     tare: busy || (health?.tare_refusal ?? ""),
     start: busy || (stopped ? "unlock first" : health?.start_refusal ?? ""),
     pause: idle || (phase === "paused" ? "it is paused" : ""),
-    resume: idle || (phase === "running" ? "nothing is paused" : ""),
+    // A hold may hide a pause.
+    resume: idle || { running: "nothing is paused", held: "a fault holds it; a pause can be ended after that" }[phase] || "",
     unlock: busy || (locked ? "" : "nothing is locked"),
     release: busy || (health?.release_refusal ?? ""),
   };

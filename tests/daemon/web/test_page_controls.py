@@ -26,7 +26,7 @@ PHASES = [
     ("idle", {"health": {"release_refusal": "the arm is moving"}}, {"tare", "start"}),
     ("running", {}, {"pause"}),
     ("paused", {}, {"resume"}),
-    ("held", {}, {"pause", "resume"}),
+    ("held", {}, {"pause"}),
     ("stopped", {"loop": {"response": "stop and keep grip"}}, {"tare", "unlock", "release"}),
     ("idle", {"robot": {"blocked": "The robot is in a protective stop."}}, {"tare", "start", "unlock", "release"}),
 ]
@@ -156,6 +156,35 @@ def test_a_page_that_opens_during_a_run_says_why_it_has_no_list_and_has_it_after
     page.wait_for_selector("#experiment:visible")
     page.wait_for_function("() => !document.querySelector('#controls-reason').textContent.includes('no list')")
     assert browsed.complaints == []
+
+
+def test_the_experiment_of_a_run_is_the_one_to_start_again(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "idle", "run": 1})
+    page.wait_for_selector("#experiment:visible")
+    picked = "document.querySelector('#experiment').selectedOptions[0].text"
+    # Somebody else starts and stops another one.
+    for phase, response in (("running", ""), ("stopped", "stop and keep grip")):
+        browsed.daemon.say(loop={"phase": phase, "run": 2, "experiment": "loosen", "response": response})
+        page.wait_for_function(f"() => {picked} === 'loosen'")
+    page.select_option("#experiment", label="hold 0.10 N·m")
+    page.wait_for_selector("[data-command=unlock]:enabled")
+    browsed.daemon.say(loop={"phase": "idle", "run": 2, "experiment": "loosen"})
+    page.wait_for_selector("[data-command=start]:enabled")
+    assert page.evaluate(picked) == "hold 0.10 N·m", "a choice of one's own stays"
+    page.evaluate("document.querySelector('#experiment').add(new Option('loosen', '/rig/copy.yaml'))")
+    browsed.daemon.say(loop={"phase": "running", "run": 3, "experiment": "loosen"})
+    page.wait_for_selector("[data-command=pause]:enabled")
+    assert page.evaluate(picked) == "hold 0.10 N·m", "two files have this name"
+
+
+def test_a_held_experiment_says_why_it_cannot_be_resumed_now(browsed):
+    page = browsed.open(token=True)
+    browsed.daemon.say(loop={"phase": "held"})
+    browsed.until("#controls-reason", "resume: a fault holds it; a pause can be ended after that")
+    assert page.locator("[data-command=resume]:disabled").count() == 1
+    browsed.daemon.say(loop={"phase": "paused"})
+    page.wait_for_selector("[data-command=resume]:enabled")
 
 
 def begin_a_start(browsed) -> Page:

@@ -232,29 +232,31 @@ def skin_torque(reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: in
 
 def skin_torque_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
-    if config.tool_radius_mm is None:
-        return None
-    return TorqueSource(name=SKIN, period_s=config.daq.sample_period_s, has_friction_band=True, reach=_reach(config))
-
-
-def _reach(config: SkinConfig) -> Reach | None:
-    """Return the torques within the calibrated curve; None without a radius, or if the calibration cannot be read."""
     radius_m = tool_radius_m(config)
+    if radius_m is None:
+        return None
+    reach, period_s = _reach(config, radius_m), config.daq.sample_period_s
+    return TorqueSource(name=SKIN, period_s=period_s, has_friction_band=True, reach=reach)
+
+
+def _reach(config: SkinConfig, radius_m: float) -> Reach | None:
+    """Return the torques at a radius within the calibrated curve; None if the calibration cannot be read.
+
+    The curve is over the skin's tension. The shear differs from it by up to the friction force, half the band of
+    `friction_band_n`.
+    """
     try:
         calibration = load_calibration(config.calibration)
     except CalibrationError:
         # The skin's task, and its part of `check`, name the mistake.
         return None
-    if radius_m is None:
-        return None
-    # What friction hides is not in the tension.
-    hidden_n = 0.5 * friction_band_n(config, calibration)
-    low_n, high_n = calibration.tension_n[0] - hidden_n, calibration.tension_n[-1] + hidden_n
+    largest_friction_n = 0.5 * friction_band_n(config, calibration)
+    low_n, high_n = calibration.tension_n[0], calibration.tension_n[-1]
     why = (
-        f"it is calibrated from {calibration.tension_n[0]:+.1f} to {calibration.tension_n[-1]:+.1f} N, and its radius "
+        f"it is calibrated from {low_n:+.1f} to {high_n:+.1f} N, and its radius is {1e3 * radius_m:g} mm; ask for "
+        "less, or calibrate it further"
     )
-    why += f"is {1e3 * radius_m:g} mm; ask for less, or calibrate it further"
-    return Reach(low_n * radius_m, high_n * radius_m, why)
+    return Reach((low_n - largest_friction_n) * radius_m, (high_n + largest_friction_n) * radius_m, why)
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:

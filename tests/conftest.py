@@ -83,23 +83,25 @@ COMPUTING = tuple(
         )),
     )
 )  # fmt: skip
-# `make test-long` runs these files and folders, `make test` all others.
+# `make test-long` runs these files and folders, and single tests with the mark `long`; `make test` all others.
 LONG = tuple(
     _TESTS / path
     for path in (
         # Endurance: many experiments, every order of events, every pace, other clocks.
         "benchmarks/test_soak.py", "daemon/control/test_no_command_beyond_limits.py",
         "daemon/control/test_runner_any_order.py", "drivers/ur/test_script_any_order.py",
-        "tools/recordings/test_replay_rig.py", "tools/recordings/test_rig_with_set_clock.py",
+        "tools/recordings/test_replay_combined.py", "tools/recordings/test_replay_rig.py",
+        "tools/recordings/test_rig_with_set_clock.py",
         # Every topic without each of its keys, through every way out.
         "tools/recordings/test_other_versions.py",
         # A newcomer's first hour, with the commands of the README.
         "cli/newcomer", "tools/commission/test_walk.py",
         # Figures: of the papers, of estimators on real recordings, of independent solutions.
         "benchmarks/test_adaptation.py", "benchmarks/test_step_response.py", "benchmarks/test_stop_times.py",
-        "cli/test_leave_out.py", "cli/test_skin.py", "estimation/skin/test_plane_strain.py",
-        "estimation/test_dead_channels.py", "studies", "tools/recordings/test_adapt.py",
-        "tools/recordings/test_shared_recordings.py", "tools/test_leave_out.py",
+        "benchmarks/test_stability_map.py", "cli/test_leave_out.py", "cli/test_skin.py",
+        "daemon/test_adapt_in_loop.py", "daemon/test_other_fingertips.py",
+        "estimation/skin/test_plane_strain.py", "estimation/test_dead_channels.py", "studies",
+        "tools/recordings/test_adapt.py", "tools/recordings/test_shared_recordings.py", "tools/test_leave_out.py",
     )
 )  # fmt: skip
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -163,10 +165,9 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return None
 
 
-def _has_real_time(path: Path) -> bool:
-    if path.is_dir():
-        return any(map(_has_real_time, path.rglob("test_*.py")))
-    return path.match("test_*.py") and "real_time" in path.read_text(encoding="utf-8")
+def _has_mark(mark: str, path: Path) -> bool:
+    files = path.rglob("test_*.py") if path.is_dir() else [path]
+    return any(file.match("test_*.py") and f"pytest.mark.{mark}" in file.read_text(encoding="utf-8") for file in files)
 
 
 # Asked once for each test; a worker has thousands of them.
@@ -181,10 +182,10 @@ def _leads_to(path: Path, part: tuple[Path, ...]) -> bool:
 
 # Of the terms by which the Makefile selects a part: whether a file or folder may have tests of it.
 PARTS: dict[str, Callable[[Path], bool]] = {
-    "real_time": _has_real_time,
+    "real_time": functools.partial(_has_mark, "real_time"),
     "computes": lambda path: _leads_to(path, COMPUTING),
     "not computes": lambda path: not _is_in(path, COMPUTING),
-    "long": lambda path: _leads_to(path, LONG),
+    "long": lambda path: _leads_to(path, LONG) or _has_mark("long", path),
     "not long": lambda path: not _is_in(path, LONG),
 }
 

@@ -253,6 +253,7 @@ def notebook_run(tmp_path_factory) -> dict[str, str]:
     return {re.split(r"\W", cell.source.splitlines()[-1])[0]: cell.outputs[-1].data["text/plain"] for cell in shown}
 
 
+@pytest.mark.long
 def test_the_notebook_compares_estimators_on_loaded_frames(notebook_run):
     rows = re.findall(r"^.*(?:fingertips?|right)  +(\d+)\.0 +(\S+) +(\S+)", notebook_run["loaded"], re.MULTILINE)
     assert len(rows) == 3

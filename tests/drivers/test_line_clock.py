@@ -52,6 +52,7 @@ def test_lines_that_wait_for_a_busy_process_are_none_missing(stalls, period):
     assert sum(missing) == 0
 
 
+@pytest.mark.long
 @given(st.lists(st.floats(0.0, 5.0), min_size=300, max_size=300))
 def test_lines_that_any_delay_holds_up_in_their_order_are_none_missing(delays):
     arrivals = [t_ns + round(late * PERIOD_NS) for t_ns, late in zip(sent(300), delays, strict=True)]
@@ -75,6 +76,7 @@ def test_a_stall_within_a_period_moves_no_time():
     assert times_ns == truth
 
 
+@pytest.mark.long
 @given(
     st.lists(st.integers(LEARN_FROM, 460), min_size=1, max_size=4, unique=True),
     st.integers(1, 40),

@@ -121,6 +121,7 @@ def test_a_diameter_is_of_this_grip_alone():
     assert np.abs(found - truth).max() < 6.0
 
 
+@pytest.mark.long
 def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few():
     of = partial(cylinder, (1, 2), 2e-5)
     calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", timing=TRUSTED)

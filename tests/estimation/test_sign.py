@@ -64,6 +64,7 @@ def held(calibration: Calibration, tool_mm: float) -> Session:
     return session
 
 
+@pytest.mark.long
 def test_a_load_cell_that_reads_negative_calibrates_several_tools():
     recordings = of_three_tools()
     fitted = fit("motion_regression", recordings, "rig", timing=TRUSTED)

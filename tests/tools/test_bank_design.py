@@ -34,6 +34,7 @@ def built(shared, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_design_is_a_configuration_that_builds(built):
     config = built / "design.yaml"
     text = config.read_text()

@@ -80,6 +80,7 @@ def malformed_frames(count: int) -> Iterator[bytes]:
             yield chance.randbytes(chance.randrange(80)).replace(b"\n", b"") + b"\n"
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ur_rtde")
 async def test_a_flood_of_malformed_frames_and_requests(config, tiny_bank, tmp_path, monkeypatch):
     arm = AsyncMock(return_value=CommandReply())

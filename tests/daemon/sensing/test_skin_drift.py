@@ -130,6 +130,7 @@ def test_the_warning_says_what_the_drift_costs_and_the_cure(calibration):
     assert " N an hour; tare with nothing on the skin" in warning
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("per_hour", [0.0, 0.002, 0.01, 0.03])
 def test_the_interval_holds_the_force_at_drifts_of_known_rates_and_is_not_much_wider(calibration, per_hour):
     """Random loads, and tares at random moments, each after a random load."""

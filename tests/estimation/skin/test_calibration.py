@@ -368,6 +368,7 @@ def test_a_direction_is_remembered_for_a_moment_only():
     assert held.index(Direction.UNKNOWN) <= 3 + round(MEMORY_S * 10)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(-1.1, 1.1), st.floats(0.03, 1.0), st.integers(0, 20)), min_size=1, max_size=5),

@@ -196,6 +196,7 @@ FAULTS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("fault", "stage", "line"), FAULTS)
 def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     """The procedure runs as a whole up to the line; for those of late stages, which take long, its stage does."""
@@ -295,6 +296,7 @@ def test_the_bounds_are_about_the_confirmed_pose_also_where_the_arm_was_moved_by
     assert lab.rig.bounds_rad() == pytest.approx((0.08 - LARGEST_RAD, 0.08 + LARGEST_RAD))
 
 
+@pytest.mark.long
 def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
     report, _ = lab.run("4", replace(COUNTS, stops=5, speeds_rad_per_s=(0.05, 0.2)))
     assert failed(report) == []
@@ -318,6 +320,7 @@ def test_a_faster_stop_is_raised_by_five_of_each_layer(lab):
     assert "0.05, 0.2, 0.2, 0.2, 0.2 rad/s" in allowed[0]
 
 
+@pytest.mark.long
 def test_the_raised_speed_is_one_from_which_a_person_stopped_the_wrist(lab, monkeypatch):
     """Each press met a wrist that was slow, near the end of its way."""
     monkeypatch.setattr(stops, "stops_by_hand", lambda *_: ([], 0.01, 0.12))
@@ -336,6 +339,7 @@ def test_a_cable_whose_samples_come_late_shows_the_whole_stop(lab):
     assert "s to rest" in line.value
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("first", "verdict"), [([["robot silence 0.2"]], "passed"), ([[], []], "passed"), ([[], [], []], "failed")]
 )

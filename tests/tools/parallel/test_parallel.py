@@ -182,6 +182,7 @@ def bank(tmp_path_factory) -> Path:
     return folder / "here.bank"
 
 
+@pytest.mark.long
 def test_evaluate_gives_the_same_figures_on_a_cluster(scheduler, shared, tmp_path, ran, result_of):
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
     calibration = str(tmp_path / "slices.cal")
@@ -199,6 +200,7 @@ def test_a_bank_of_a_cluster_has_the_same_bytes(bank, scheduler):
     assert again.read_bytes() == bank.read_bytes()
 
 
+@pytest.mark.long
 def test_a_chart_of_a_cluster_has_the_same_numbers(scheduler, tmp_path):
     from shearloop.estimation import Physics
     from shearloop.studies.charts.chart_data import Split, own_fingertip, synthetic_slices

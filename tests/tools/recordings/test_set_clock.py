@@ -161,6 +161,7 @@ def test_calibrate_and_evaluate_get_the_same_series(plain, stepped):
         np.testing.assert_array_equal(getattr(found, name), getattr(truth, name))
 
 
+@pytest.mark.long
 def test_every_export_is_the_same(plain, stepped, tmp_path, ran):
     pytest.importorskip("pyarrow", reason="needs the extra `export`")
     topics = ("eit.frame.right", "eit.estimate.right", "load.torque", "input.right")
@@ -214,6 +215,7 @@ def test_a_repaired_copy_has_the_same_times(plain, stepped, tmp_path):
     assert len(summarise(copy).clock_steps) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("age", ["new", "old"])
 @pytest.mark.parametrize("set_s", [-5.0, -2e-9], ids=["a step back", "a reading of the clocks"])
 def test_bunched_readings_keep_their_places_in_every_table(set_s, age, tmp_path, ran):

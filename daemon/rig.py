@@ -174,14 +174,18 @@ def make_loop(
     if supplied.actuation_s is not None and "actuation_s" not in config.loop.model_fields_set:
         loop = loop.model_copy(update={"actuation_s": supplied.actuation_s})
     required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-    gels = {
+    # Its thread begins with the first check of a gain.
+    compute = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gain").submit
+    return ControlLoop(loop, sources, required, gels_of(config), dead_tasks, patience_of(config), compute)
+
+
+def gels_of(config: DaemonConfig) -> dict[str, Creep]:
+    """Return the creep of each fingertip, or of all together, whose gel's creep is configured: a new one, at rest."""
+    return {
         name: Creep(fingertip.creep.share, fingertip.creep.time_s)
         for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
         if fingertip is not None and fingertip.creep is not None
     }
-    # Its thread begins with the first check of a gain.
-    compute = ThreadPoolExecutor(max_workers=1, thread_name_prefix="gain").submit
-    return ControlLoop(loop, sources, required, gels, dead_tasks, patience_of(config), compute)
 
 
 def make_gripper(

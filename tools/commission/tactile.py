@@ -2,16 +2,18 @@
 
 import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Final
 
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.creep import Creep
 from shearloop.daemon.sensing.fingertip_task import tactile_frame
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.sessions import COMBINED, open_combined, open_session
 from shearloop.drivers.eit_kit import Frame
 from shearloop.errors import UserError
 from shearloop.estimation import Session
-from shearloop.estimation.values import Estimate
+from shearloop.estimation.values import Estimate, TactileFrame
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.listening import SILENT_S
 
@@ -24,9 +26,17 @@ _MAX_FRAMES: Final = 60
 class TactileSensor:
     """One fingertip, or several together: the state of a run, and the frames that it has not taken yet."""
 
-    def __init__(self, name: str, session: Session, boards: Mapping[str, Arrivals[Frame]], period_s: float) -> None:
-        """Take the boards of the session's fingertips by their names."""
+    def __init__(
+        self,
+        name: str,
+        session: Session,
+        boards: Mapping[str, Arrivals[Frame]],
+        period_s: float,
+        creep: Creep | None = None,
+    ) -> None:
+        """Take the boards of the session's fingertips by their names, and the creep that the control loop subtracts."""
         self.name = name
+        self._creep = creep
         self._session, self._boards, self._period_s = session, boards, period_s
         # The frames of each board from this time on were not taken.
         self._from_ns = dict.fromkeys(boards, 0)
@@ -42,12 +52,22 @@ class TactileSensor:
         for name, frame in frames:
             self._from_ns[name] = frame.t_mid_ns + 1
             if (together := self._pairing.add(name, frame)) is not None:
-                estimates.append(self._session.estimate(tactile_frame(together)))
+                estimates.append(self._estimate(tactile_frame(together)))
         return estimates
+
+    def _estimate(self, frame: TactileFrame) -> Estimate:
+        """Return the estimate with the torque that the control loop has."""
+        estimate = self._session.estimate(frame)
+        if self._creep is None or estimate.torque_nm is None:
+            return estimate
+        t_ns = round(1e9 * (frame.t_s - estimate.lag_s))
+        return replace(estimate, torque_nm=self._creep.torque_nm(estimate.torque_nm, t_ns))
 
     def tare(self, now_ns: int) -> None:
         """Take a new idle frame of untouched fingertips, from frames that begin after now; UserError without one."""
         self._session.tare()
+        if self._creep is not None:
+            self._creep.reset()
         self._from_ns = dict.fromkeys(self._boards, now_ns + round(0.5e9 * self._period_s))
         reason = ""
         for _ in range(_MAX_FRAMES):

@@ -9,6 +9,7 @@ from typing import Final, Self
 
 from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.motion_cap import CAPPED_NM
+from shearloop.daemon.rig import gels_of
 from shearloop.daemon.rig_identity import source_sha256
 from shearloop.daemon.supplied_values import Supplied
 from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, direction_of
@@ -141,10 +142,11 @@ def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
         name: opened.enter_context(context.rig.fingertip(name))
         for name in dict.fromkeys(side for _, sides in sessions.values() for side in sides)
     }
-    return [
-        TactileSensor(name, session, {side: boards[side] for side in sides}, config.fingertips[sides[0]].frame_period_s)
-        for name, (session, sides) in sessions.items()
-    ]
+    gels, found = gels_of(config), []
+    for name, (session, sides) in sessions.items():
+        own, period_s = {side: boards[side] for side in sides}, config.fingertips[sides[0]].frame_period_s
+        found.append(TactileSensor(name, session, own, period_s, gels.get(name)))
+    return found
 
 
 def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:

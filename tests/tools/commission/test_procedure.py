@@ -208,6 +208,20 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     assert load_report(lab.path.with_name("report.yaml")) == report
 
 
+def test_the_torque_of_a_gel_that_creeps_is_compared_without_its_creep(lab):
+    """The emulated gel does not creep, so a configured creep takes half of its torque away."""
+
+    def scale() -> str:
+        report, _ = lab.run("7")
+        return next(line for line in report.stages[0].lines if line.what == "scale of right").value
+
+    without = scale()
+    content = yaml.safe_load(lab.path.read_text())
+    content["fingertips"]["right"]["creep"] = {"share": 0.5, "time_s": 0.001}
+    lab.path.write_text(yaml.safe_dump(content))
+    assert float(scale().split()[0]) == pytest.approx(0.5 * float(without.split()[0]), abs=0.02)
+
+
 @pytest.fixture
 def skin_lab(tmp_path) -> Iterator[Lab]:
     lab = Lab(tmp_path, fingertips={}, load_cell=None)

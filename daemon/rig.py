@@ -278,6 +278,10 @@ class Rig:
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
         if (reason := deadline.why_passed("reading its file", _SLOW_FILE)) is not None:
             return reason
+        # A stop since the request is the runner's to answer.
+        stopped = self.runner.stop_count != stops_before
+        if not stopped and (reason := self.runner.refusal_of(experiment.file, confirmed=confirmed)) is not None:
+            return reason
         try:
             reason = await self.memory.begins(experiment.file.name) or deadline.why_passed("keeping the rig's state")
             if reason is None:

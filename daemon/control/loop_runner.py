@@ -177,6 +177,12 @@ class ControlLoopRunner:
         """Return why no experiment at all can begin, or None."""
         return self.busy() or self._control_loop.start_refusal() or self._taring()
 
+    def refusal_of(self, file: ExperimentFile, *, confirmed: bool = False) -> str | None:
+        """Return why an experiment cannot begin once the arm is enabled, or None; `confirmed`: a tool may drop."""
+        if (reason := self.busy() or self._taring()) is not None:
+            return reason
+        return self._control_loop.refusal_of(file, self._clock.now_ns(), confirmed=confirmed, is_enabled=False)
+
     def busy(self) -> str | None:
         """Return what is under way and refuses every command but `stop`, or None."""
         if self._closed:
@@ -218,11 +224,7 @@ class ControlLoopRunner:
             return ENDING
         stops_before = self._stop_count if stops_before is None else stops_before
         # An arm is not enabled for an experiment that cannot begin. What refuses it may also come until it is enabled.
-        refusal = (
-            self.busy()
-            or self._taring()
-            or self._control_loop.refusal_of(file, self._clock.now_ns(), confirmed=confirmed, is_enabled=False)
-        )
+        refusal = self.refusal_of(file, confirmed=confirmed)
         if self._stop_count == stops_before and refusal is None:
             refusal = await self._enable() or deadline.why_passed("enabling the arm")
         if self._stop_count != stops_before:

@@ -249,6 +249,7 @@ class Runner:
 
     def __init__(self, refusal: str | None = None) -> None:
         self.refusal = refusal
+        self.unconfirmed_refusal: str | None = None
         self.stop_count = 0
         self.started: list[tuple[str, int]] = []
 
@@ -257,6 +258,9 @@ class Runner:
 
     def motion(self) -> str | None:
         return self.refusal
+
+    def refusal_of(self, _file: Any, *, confirmed: bool) -> str | None:
+        return None if confirmed else self.unconfirmed_refusal
 
     async def start(self, file: Any, stops_before: int, _deadline: Deadline, *, confirmed: bool) -> None:
         self.started.append((file.name, stops_before))
@@ -304,6 +308,28 @@ async def test_a_state_that_cannot_be_kept_refuses_every_start_before_its_questi
     assert one.start_refusal() == "the disk is full"
     with pytest.raises(CommandRefusedError, match="the disk is full"):
         await answers_of(one)["start"]({"experiment": str(write(folder / "one.yaml", VALID)), "ask": True})
+
+
+class Noted(NoMemory):
+    """Notes the experiments that begin."""
+
+    def __init__(self) -> None:
+        self.noted: list[str] = []
+
+    async def begins(self, experiment: str) -> None:
+        self.noted.append(experiment)
+
+
+async def test_an_experiment_that_is_refused_is_not_kept_as_the_one_that_runs(folder):
+    """A daemon that is killed then would leave a stop of an experiment that had never begun."""
+    runner, path = Runner(), write(folder / "one.yaml", VALID)
+    one, runner.unconfirmed_refusal = rig(folder, runner), "a tool drops"
+    one.memory = memory = Noted()
+    assert await one.start(path) == "a tool drops"
+    assert (memory.noted, runner.started) == ([], [])
+    assert await one.start(path, confirmed=True) is None
+    assert memory.noted == ["one"]
+    assert len(runner.started) == 1
 
 
 async def test_no_file_is_read_while_none_can_start(folder, monkeypatch):

@@ -100,7 +100,8 @@ class Context:
     def expect_no_other_program(self) -> None:
         """Return once nothing else commands the robot, or the operator accepts what does; raises DeclinedError.
 
-        Raises UserError where others write all registers. A program is asked about each time; it would be replaced.
+        Raises UserError where others write all registers, or a program may be another daemon's. Any other program is
+        asked about each time; it would be replaced.
         """
         if self._mover is not None:
             # The observer reads the robot's state all the time. Only our program changes this clock.
@@ -115,7 +116,13 @@ class Context:
             # The last commissioning's may end by its watchdog.
             self.clock.sleep(ENDS_ITSELF_S)
             outputs = self.rig.outputs(self.registers)
-        for sign in other_programs(seen, outputs):
+        signs = other_programs(seen, outputs)
+        if {sign.kind for sign in signs} == {*SignKind}:
+            raise UserError(
+                f"{' '.join(sign.sentence for sign in signs)} The commissioning does not end that program, because a "
+                "stop may wait there: end the other daemon, or stop the program at the teach pendant, then run it again"
+            )
+        for sign in signs:
             if sign not in self._accepted:
                 moves = "The commissioning replaces such a program, and moves robot and gripper."
                 self.operator.accept(f"{sign.sentence} {moves}")

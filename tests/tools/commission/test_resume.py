@@ -136,6 +136,26 @@ def test_another_program_on_the_robot_is_named_before_each_stage_that_moves(
 
 
 @pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("runtime_state", [2, 4])
+def test_another_daemons_program_is_not_offered_to_be_replaced(tmp_path, monkeypatch, runtime_state):
+    """Its registers are in use, and the worker refuses to end it: a stop may wait there."""
+    ran = play_stages(monkeypatch, dict.fromkeys(("0 identity", "1 b"), "passed"))
+    path, asked = write_rig(tmp_path, "127.0.0.9"), []
+    controller, outputs = replace(CONTROLLER, registers=LOWER), replace(OUTPUTS, runtime_state=runtime_state)
+    rig = SimpleNamespace(controller=lambda: controller, outputs=lambda _: outputs, clock=NO_CLOCK)
+
+    def answer(question: str) -> str:
+        asked.append(question)
+        return "continue" if "Type `continue`" in question else WORD
+
+    operator = Operator(answer, lambda _: None, allows=True)
+    with pytest.raises(UserError, match="end the other daemon, or stop the program at the teach pendant"):
+        procedure.commission(load_daemon_config(path), path, tmp_path / "report.yaml", operator, Counts(), (), rig)
+    assert ran == ["0 identity"]
+    assert not any("Type `continue`" in question for question in asked)
+
+
+@pytest.mark.usefixtures("ur_rtde")
 def test_a_robot_whose_registers_are_all_taken_is_not_moved_by_a_later_run(tmp_path, monkeypatch):
     """Stage 0 passed earlier."""
     ran = play_stages(monkeypatch, {"0 identity": "passed", "3 b": "passed"})

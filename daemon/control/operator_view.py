@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, Step
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, ReleaseStep, Step
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD
@@ -181,17 +181,22 @@ class OperatorView:
         )
 
     def _why_no_grip(self, file: ExperimentFile) -> str | None:
-        """Return why the first `grip` would open the fingers on the held tool, or None."""
-        first, gripper, held = first_grip(file), self.inputs.gripper, self.tool.held
-        if first is None or gripper is None or held is None:
+        """Return why a `grip` before any release would open the fingers on the held tool, or None.
+
+        The gripper refuses it too, in the middle of the experiment: a grip never opens them on a tool.
+        """
+        gripper, held = self.inputs.gripper, self.tool.held
+        if gripper is None or held is None:
             return None
-        number, step = first
-        if step.width_mm <= gripper.width_mm:
-            return None
-        return (
-            f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "
-            "it, or correct `width_mm`"
-        )
+        for number, step in enumerate(file.steps, 1):
+            if isinstance(step, ReleaseStep):
+                return None
+            if isinstance(step, GripStep) and step.width_mm > gripper.width_mm:
+                return (
+                    f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a "
+                    "`release` before it, or correct `width_mm`"
+                )
+        return None
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""

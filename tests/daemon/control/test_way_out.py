@@ -576,7 +576,11 @@ def grip_to(width_mm: float) -> dict[str, Any]:
         ({}, [WAIT, {"do": "release"}], f"step 2 {OPENS}"),
         # The held tool is in the tighter grip too.
         ({}, [GRIP, TURN, {"do": "release"}], f"step 3 {OPENS}"),
-        ({}, [GRIP, {"do": "grip", "width_mm": 140.0}], "step 2 (grip) opens the gripper, and a tool in it drops"),
+        (
+            {"uncertain": True},
+            [GRIP, {"do": "grip", "width_mm": 140.0}],
+            "step 2 (grip) opens the gripper, and a tool in it drops",
+        ),
         ({"uncertain": True}, [{"do": "release"}], f"step 1 {OPENS}the gripper does not know whether it holds a tool"),
         ({"unfelt": True}, [{"do": "grip", "width_mm": 140.0}], "step 1 (grip) opens the gripper, and a tool in it"),
         # Less wide than the fingers are at the start, and wider than the grip before.

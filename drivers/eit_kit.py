@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.frame_clock import LATE_NS, LONGEST_GAP, FrameClock
-from shearloop.drivers.refused_lines import refusal_sentence
+from shearloop.drivers.refused_lines import CABLE, refusal_of
 from shearloop.drivers.serial_sensor import InputRecorder, Parser, SerialSensor
+from shearloop.errors import Hint
 
 CELL_BYTES = len(b"0.1234, ")
 # Twice a line of 32 electrodes: a line with a wrong count is shorter, a stream without newlines is longer.
@@ -60,7 +61,7 @@ class FrameErrorKind(Enum):
     TOO_LONG = f"a line of more than {MAX_LINE_BYTES} bytes: newlines are lost, or this is not an EIT-kit"
     WRONG_COUNT = "a line without all of its values, each followed by a comma and a space: bytes were lost"
     NOT_A_NUMBER = "a value that is not written as 0.1234: bytes were lost or changed"
-    NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
+    NAN = "a value that is NaN: the board divided by zero"
     OUT_OF_RANGE = f"a value above the ADC's {ADC_REFERENCE_V} V: bytes were changed"
     NONZERO_SLOT = "a value where the pair touches a driven electrode and 0 belongs: a different injection pattern"
     TOO_SOON = "a frame less than half a period after the one before: it waited on its way, and its time is unknown"
@@ -78,14 +79,19 @@ class FrameError:
     position: int | None = None
     count: str = ""
 
-    def sentence(self, in_a_row: int) -> str:
-        """Return the line for health and log, and the reason; of whole lines in a row who sends them."""
+    def hint(self, in_a_row: int) -> Hint:
+        """Return the line for health and log with the reason, and the cure; of whole lines in a row who sends them."""
         if self.position is None or b"," in self.excerpt:
-            return refusal_sentence(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit", in_a_row)
+            return refusal_of(self.excerpt, f"{self.kind.value}{self.count}", "EIT-kit", in_a_row)
         read = repr(self.excerpt)[1:]
-        return f"refused {read} at value {self.position + 1}: {self.kind.value}"
+        return Hint(f"refused {read} at value {self.position + 1}: {self.kind.value}", _CURES.get(self.kind, CABLE))
 
 
+# Of a value; those of others are a cable's.
+_CURES = {
+    FrameErrorKind.NAN: "restart the board so that it calibrates again",
+    FrameErrorKind.NONZERO_SLOT: "give `injection` of the fingertip's file as the board drives it",
+}
 # Lines without their ends, whose number is unknown.
 _LOST_BYTES = (FrameErrorKind.TOO_LONG, FrameErrorKind.WRONG_COUNT)
 # What remains of a line that was under way when the port was opened.
@@ -216,7 +222,7 @@ class FrameParser(Parser[Frame]):
         self._count_refused(FrameErrorKind.TOO_SOON)
         every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {period_ns / 1e9:.2g} s"
         cure = "if that goes on, see `frame_period_s`, and what keeps the board or this computer busy"
-        self.refusal = f"refused {FrameErrorKind.TOO_SOON.value} ({every}); {cure}"
+        self.refusal = Hint(f"refused {FrameErrorKind.TOO_SOON.value} ({every})", cure)
         return False
 
     def _read(self, line: bytes | None) -> NDArray[np.float64] | FrameError | None:
@@ -232,7 +238,7 @@ class FrameParser(Parser[Frame]):
         return found
 
     def _reject(self, error: FrameError) -> None:
-        self.refusal = error.sentence(self._count_refused(error.kind))
+        self.refusal = error.hint(self._count_refused(error.kind))
         if error.kind in _LOST_BYTES:
             self._rejected_since_frame = None
         elif self._rejected_since_frame is not None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
 from shearloop.drivers.line_clock import LineClock
-from shearloop.drivers.refused_lines import BoardKind, refusal_sentence
+from shearloop.drivers.refused_lines import BoardKind, refusal_of
 from shearloop.drivers.serial_sensor import Parser
 
 ValueT = TypeVar("ValueT")
@@ -84,4 +84,4 @@ class LineParser(Parser[ValueT]):
 
     def _refuse(self, line: bytes, kind: str) -> None:
         self._clock.refused()
-        self.refusal = refusal_sentence(line, kind, self.board, self._count_refused(kind))
+        self.refusal = refusal_of(line, kind, self.board, self._count_refused(kind))

@@ -15,6 +15,7 @@ from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positi
 from shearloop.drivers.connection import Diagnostics, Link
 from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.line_parser import LineParser, TimedLine
+from shearloop.errors import Hint
 
 BAUD_RATE = 115200
 # The ends of the converter's range (HX711 data sheet, "Output data": 24 bits, two's complement).
@@ -31,17 +32,17 @@ SLEW_NM_PER_S = 2.0
 # would be five thousand.
 _MAX_UNITS = 10_000
 # Why a line has another unit than the calibration, and the cure.
-COUNTS_REASON = (
-    "the board sends counts and has no calibration; run `shearloop calibrate load` and name its file as "
-    "`load_cell.calibration`"
+COUNTS_REASON = Hint(
+    "the board sends counts and has no calibration",
+    "run `shearloop calibrate load` and name its file as `load_cell.calibration`",
 )
-COUNTS_FOR_TORQUES = (
-    "the board sends counts, and `load_cell.calibration` is of a board that sends torques or weights; run `shearloop "
-    "calibrate load` with this board"
+COUNTS_FOR_TORQUES = Hint(
+    "the board sends counts, and `load_cell.calibration` is of a board that sends torques or weights",
+    "run `shearloop calibrate load` with this board",
 )
-TORQUES_FOR_COUNTS = (
-    "the board sends N·m, and `load_cell.calibration` is of a board that sends counts; take the key `calibration` out "
-    "of the configuration, or run `shearloop calibrate load` with this board"
+TORQUES_FOR_COUNTS = Hint(
+    "the board sends N·m, and `load_cell.calibration` is of a board that sends counts",
+    "take the key `calibration` out of the configuration, or run `shearloop calibrate load` with this board",
 )
 
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
@@ -111,7 +112,7 @@ class LoadSample:
     spike: bool = False
     stuck: bool = False
     partial: bool = False
-    other_unit: str = ""
+    other_unit: Hint | None = None
 
     @property
     def trusted(self) -> bool:
@@ -176,18 +177,18 @@ class LoadParser(LineParser[LoadSample]):
             spike=spike,
             stuck=self._repeats >= self._stuck_after,
             partial=line.partial,
-            other_unit="" if saturated or line.partial else self._other_unit(raw, line.text, spike=spike),
+            other_unit=None if saturated or line.partial else self._other_unit(raw, line.text, spike=spike),
         )
         self.flagged += not sample.trusted
         return sample
 
-    def _other_unit(self, raw: float, text: bytes, *, spike: bool) -> str:
+    def _other_unit(self, raw: float, text: bytes, *, spike: bool) -> Hint | None:
         if self.calibration.takes_counts:
-            return TORQUES_FOR_COUNTS if b"." in text and abs(raw) <= CAPACITY_NM else ""
+            return TORQUES_FOR_COUNTS if b"." in text and abs(raw) <= CAPACITY_NM else None
         # A board of torques has a line within its capacity before one that is corrupted.
         if spike and (self._whole_numbers or not self._fits):
             return COUNTS_REASON if self.calibration.takes_torque else COUNTS_FOR_TORQUES
-        return ""
+        return None
 
     def _is_reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
         # By the arrival: before a late line others may be missing. No interval counts as shorter than a period.

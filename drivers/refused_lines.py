@@ -4,6 +4,8 @@ import re
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from shearloop.errors import Hint
+
 BoardKind = Literal["EIT-kit", "load cell", "skin's converter board"]
 
 # So many lines that are refused in a row show who sends them. A single one may be a part of the board's own line.
@@ -11,6 +13,8 @@ REPEATED: Final = 3
 # Characters of a refused line in a message.
 SHOWN_BYTES: Final = 40
 
+# The cure of bytes that were lost or changed.
+CABLE: Final = "replace the USB cable if more of them come"
 _EXCHANGE: Final = "name each board by its own port in the configuration (`shearloop ports` lists them)"
 _SKETCH: Final = {
     "EIT-kit": "load the program that sends all values of a frame in one line, each as `0.1234, `",
@@ -82,10 +86,10 @@ def sender_of(line: bytes, expected: BoardKind) -> tuple[str, str]:
     return sender.who, _EXCHANGE
 
 
-def refusal_sentence(line: bytes, reason: str, expected: BoardKind, in_a_row: int = REPEATED) -> str:
-    """Return the line with the reason against it, and the cure after a semicolon; of repeated ones who sends them."""
+def refusal_of(line: bytes, reason: str, expected: BoardKind, in_a_row: int = REPEATED) -> Hint:
+    """Return the line with the reason against it, and the cure; of repeated ones who sends them."""
     found = f"refused {shown(line)}: {reason}"
     if in_a_row < REPEATED:
-        return f"{found}. A single line like this has lost bytes on its way; replace the USB cable if more of them come"
+        return Hint(f"{found}. A single line like this has lost bytes on its way", CABLE)
     who, cure = sender_of(line, expected)
-    return f"{found}. {who[0].upper()}{who[1:].rstrip(',')} sends such lines; {cure}"
+    return Hint(f"{found}. {who[0].upper()}{who[1:].rstrip(',')} sends such lines", cure)

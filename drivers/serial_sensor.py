@@ -12,6 +12,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from shearloop.drivers.connection import Diagnostics, Link, Port
 from shearloop.drivers.errors import DeviceLostError, DriverError
 from shearloop.drivers.refused_lines import shown
+from shearloop.errors import Hint
 
 # Opening the port resets an Uno; its boot loader waits before it starts the sketch.
 BOOT_S = 4.0
@@ -116,13 +117,13 @@ class LineSplitter:
 class Parser(ABC, Generic[ValueT]):
     """Turns events into values, and counts the refused lines by their kind, since the beginning. No I/O.
 
-    `refusal` is the sentence on the last refused line, empty without one.
+    `refusal` says why the last refused line was refused, and what helps; None without one.
     """
 
     def __init__(self, max_bytes: int) -> None:
         """Accept lines of at most `max_bytes`."""
         self.errors: Counter[Any] = Counter()
-        self.refusal = ""
+        self.refusal: Hint | None = None
         self._lines = LineSplitter(max_bytes)
         # Without a value in between.
         self._refused_in_a_row = 0
@@ -300,11 +301,11 @@ class SerialSensor(Generic[ValueT]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        recent = self._values_since_refusal < FORGET_REFUSAL_VALUES
+        refusal = self._parser.refusal if self._values_since_refusal < FORGET_REFUSAL_VALUES else None
         return {
             **self._link.diagnostics(),
             "dropped_at_opening": self._parser.dropped_at_opening,
-            "last_refusal": self._parser.refusal if recent else "",
+            "last_refusal": "" if refusal is None else refusal.clause,
         }
 
     def _check_use(self, port: Port, now_ns: int, *, useful: bool) -> None:
@@ -312,8 +313,9 @@ class SerialSensor(Generic[ValueT]):
         waited_s = (now_ns - self._value_ns) / 1e9
         if not useful:
             if waited_s > max(BOOT_S, self._silence_s):
-                why = self._parser.refusal or f"no line end in {shown(self._parser.unfinished)}; see its program"
-                raise DeviceLostError(f"{port.path} has sent nothing of use for {waited_s:.1f} s: {why}")
+                unended = Hint(f"no line end in {shown(self._parser.unfinished)}", "see its program")
+                why = self._parser.refusal or unended
+                raise DeviceLostError(f"{port.path} has sent nothing of use for {waited_s:.1f} s: {why.clause}")
             return
         self._value_ns = now_ns
         self._prompt_values = self._prompt_values + 1 if waited_s < 0.5 * self.longest_silence_s else 0
@@ -327,9 +329,9 @@ class SerialSensor(Generic[ValueT]):
         before = self._parser.refused
         values = self._parser.handle(event)
         self._values_since_refusal += len(values)
-        if self._parser.refused > before:
+        if self._parser.refused > before and self._parser.refusal is not None:
             self._values_since_refusal = 0
-            self._link.monitor.refused(self._parser.refusal)
+            self._link.monitor.refused(self._parser.refusal.clause)
         return values
 
     async def _open(self) -> Port:

@@ -81,8 +81,8 @@ async def _read_samples(port: "SerialPort", samples: "asyncio.Queue[LoadSample]"
             until_s = clock.time() + GIVE_UP_S
             samples.put_nowait(sample)
     nothing = f"no reading came from {port.path} within {GIVE_UP_S:g} s"
-    if parser.refusal:
-        raise DeviceLostError(f"{nothing}: {parser.refusal}")
+    if parser.refusal is not None:
+        raise DeviceLostError(f"{nothing}: {parser.refusal.clause}")
     if parser.unfinished:
         raise DeviceLostError(f"{nothing}, only {shown(parser.unfinished)} without a line end; see its program")
     raise DeviceLostError(

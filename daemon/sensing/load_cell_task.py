@@ -98,9 +98,11 @@ class LoadCellTask:
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
-        other_unit = self._latest.other_unit if self._latest is not None else ""
-        zero_error = self._zero.reason if self._zero is not None else ""
-        own = zero_error or other_unit or found["last_refusal"]
+        own = found["last_refusal"]
+        if self._latest is not None and self._latest.other_unit is not None:
+            own = self._latest.other_unit.clause
+        if self._zero is not None and self._zero.reason:
+            own = self._zero.reason
         error = own if found["connected"] else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
@@ -178,8 +180,8 @@ def _reason(sample: LoadSample) -> str:
     """Return why a reading is not trusted, or an empty text."""
     if sample.trusted:
         return ""
-    if sample.other_unit:
-        return sample.other_unit
+    if sample.other_unit is not None:
+        return sample.other_unit.clause
     flags = {
         "at the end of its range": sample.saturated,
         "further from the last one than the rig can move": sample.spike,

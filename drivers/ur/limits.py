@@ -9,6 +9,7 @@ from collections import deque
 from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, WristSpeed
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, is_close, turn_between
 from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
+from shearloop.errors import Hint
 
 WRIST = 5
 # The longest stop, however gentle the command.
@@ -147,35 +148,37 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     for measurement in (*speeds, tool, *_loads(sample, limits)):
         if beyond := _beyond(*measurement):
             return beyond
-    return slowed_sentence(sample) or tool_difference(sample, settings.tool)
+    found = slowed_by(sample) or tool_difference(sample, settings.tool)
+    return found.sentence if found is not None else ""
 
 
-def slowed_sentence(sample: RtdeOutputs) -> str:
-    """Return why the arm turns slower than commanded, or the empty string: a factor on speeds is a gain of the loop."""
+def slowed_by(sample: RtdeOutputs) -> Hint | None:
+    """Return what makes the arm turn slower than commanded, or None: a factor on speeds is a gain of the loop."""
     if abs(sample.speed_slider - 1.0) > SCALING_TOLERANCE:
-        return (
+        return Hint(
             f"The speed slider is at {100 * sample.speed_slider:.0f} %, which slows every motion and changes the "
-            "control loop's gain: set it to 100 % at the bottom of the teach pendant's screen (on a CB3, of its tabs "
-            "Run and Move)."
+            "control loop's gain",
+            "set it to 100 % at the bottom of the teach pendant's screen (on a CB3, of its tabs Run and Move)",
         )
     if abs(sample.limiter_scaling - 1.0) > SCALING_TOLERANCE:
-        return (
+        return Hint(
             f"The controller slows every motion to {100 * sample.limiter_scaling:.0f} % by itself, which changes the "
-            "control loop's gain: look at the teach pendant for its limits of speed and power."
+            "control loop's gain",
+            "look at the teach pendant for its limits of speed and power",
         )
-    return ""
+    return None
 
 
-def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
-    """Return how payload, centre of gravity or tool centre point differ from the settings, or the empty string.
+def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> Hint | None:
+    """Return how payload, centre of gravity or tool centre point differ from the settings, or None.
 
     A value that the controller does not report is NaN and differs.
     """
     load, cog, tcp = tool.payload_kg, tool.payload_cog_m, tool.tcp_offset
     if not tool.reported and _is_reported(sample.payload_kg):
-        return (
-            "The controller reports its payload, and the robot's settings say that it does not: enter payload_kg, "
-            "payload_cog_m and tcp_offset of `tool` in the place of `reported`."
+        return Hint(
+            "The controller reports its payload, and the robot's settings say that it does not",
+            "enter payload_kg, payload_cog_m and tcp_offset of `tool` in the place of `reported`",
         )
     checks = (
         ("payload_kg", load, sample.payload_kg, load is None or abs(sample.payload_kg - load) < PAYLOAD_KG),
@@ -184,16 +187,17 @@ def tool_difference(sample: RtdeOutputs, tool: InstalledTool) -> str:
     )  # fmt: skip
     for name, configured, found, same in checks:
         if not same and not _is_reported(found):
-            return (
-                f"The controller does not report {name}, and the robot's settings have {_rounded(configured)}: install "
-                "PolyScope 3.12 (CB3) or 5.5.1 (e-Series), or write `tool: {reported: false}` into the settings."
+            return Hint(
+                f"The controller does not report {name}, and the robot's settings have {_rounded(configured)}",
+                "install PolyScope 3.12 (CB3) or 5.5.1 (e-Series), or write `tool: {reported: false}` into the "
+                "settings",
             )
         if not same:
-            return (
-                f"The controller has {name} {_rounded(found)}, the robot's settings have {_rounded(configured)}: "
-                "correct the payload and the tool centre point at the teach pendant, or the settings."
+            return Hint(
+                f"The controller has {name} {_rounded(found)}, the robot's settings have {_rounded(configured)}",
+                "correct the payload and the tool centre point at the teach pendant, or the settings",
             )
-    return ""
+    return None
 
 
 def _is_reported(value: float | tuple[float, ...]) -> bool:

@@ -10,7 +10,7 @@ class UserError(Exception):
 
 
 class Hint(NamedTuple):
-    """Something that works less well than it could, and what helps; both without a full stop."""
+    """Something that works less well than it could or not at all, and what helps; both without a full stop."""
 
     cause: str
     cure: str
@@ -19,6 +19,11 @@ class Hint(NamedTuple):
     def sentence(self) -> str:
         """Both as one sentence."""
         return f"{self.cause}: {self.cure}."
+
+    @property
+    def clause(self) -> str:
+        """Both as a part of a sentence."""
+        return f"{self.cause}; {self.cure}"
 
 
 class ActionError(Exception):

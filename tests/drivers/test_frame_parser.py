@@ -87,8 +87,8 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
         frames = parser.feed(GOOD + broken + LINES[1], 0)
         assert dict(parser.errors) == {kind: 1}, broken[:20]
         assert [format_line(frame.raw) for frame in frames] == [GOOD, LINES[1]]
-        assert kind.value in parser.refusal
-        assert len(parser.refusal) < 600
+        assert kind.value in parser.refusal.cause
+        assert len(parser.refusal.clause) < 600
 
 
 @pytest.mark.parametrize("silent", [[500], range(56), range(896)])
@@ -107,7 +107,7 @@ def test_a_channel_that_reads_0_is_dead_in_that_frame_and_refuses_no_other(silen
 def test_a_refusal_says_which_value_it_was():
     refusal = eit_kit.read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), PAPER_TABLE.zero_slots)
     assert refusal.position == CHANNEL
-    assert f"refused '-0.1234' at value {CHANNEL + 1}" in refusal.sentence(1)
+    assert f"refused '-0.1234' at value {CHANNEL + 1}" in refusal.hint(1).cause
 
 
 @given(st.data())
@@ -261,8 +261,8 @@ def test_frames_of_one_board_are_never_closer_than_half_a_period():
         frames += parser.feed(LINES[number % 2], back_ns + 31_000_000 + number * PERIOD_NS)
     assert np.diff([frame.t_mid_ns for frame in frames]).min() > 0.5 * PERIOD_NS
     assert parser.errors == {FrameErrorKind.TOO_SOON: 5}
-    assert "refused a frame less than half a period after the one before" in parser.refusal
-    assert f"where one comes every {PERIOD_NS / 1e9:.2g} s" in parser.refusal
+    assert "refused a frame less than half a period after the one before" in parser.refusal.cause
+    assert f"where one comes every {PERIOD_NS / 1e9:.2g} s" in parser.refusal.cause
     assert [frame.seq for frame in frames] == list(range(len(frames)))
     assert parser.clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-6)
 
@@ -350,7 +350,7 @@ def test_a_frame_that_is_too_soon_counts_as_refused_and_does_not_accuse_another_
         parser.feed(LINES[number % 4], back_ns + number)
     assert (parser.refused, dict(parser.errors)) == (5, {FrameErrorKind.TOO_SOON: 5})
     parser.feed(b"1.0\n", back_ns + 10)
-    assert "A single line like this has lost bytes" in parser.refusal
+    assert "A single line like this has lost bytes" in parser.refusal.cause
 
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))

@@ -22,7 +22,7 @@ from shearloop.drivers.load_cell import (
     LoadCalibration,
     LoadParser,
 )
-from shearloop.drivers.refused_lines import refusal_sentence
+from shearloop.drivers.refused_lines import refusal_of
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.slices import slices
 
@@ -226,10 +226,10 @@ OF_GRAMS = LoadCalibration(tare_counts=12.0, scale_n_per_count=9.80665e-3)
         (OF_GRAMS, ["-812500", "-812480", "-812475"], COUNTS_FOR_TORQUES),
         (OF_COUNTS, ["0.0123", "-0.0401", "0.0000"], TORQUES_FOR_COUNTS),
         (OF_COUNTS, ["0.00", "0.01", "0.00"], TORQUES_FOR_COUNTS),
-        (OF_COUNTS, ["81250", "81310", "81190"], ""),
-        (OF_COUNTS, ["81250.00", "81310.12", "81190.50"], ""),
-        (OF_TORQUES, ["0.0123", "-0.0401", "0"], ""),
-        (OF_GRAMS, ["12.5", "13.25", "0.00"], ""),
+        (OF_COUNTS, ["81250", "81310", "81190"], None),
+        (OF_COUNTS, ["81250.00", "81310.12", "81190.50"], None),
+        (OF_TORQUES, ["0.0123", "-0.0401", "0"], None),
+        (OF_GRAMS, ["12.5", "13.25", "0.00"], None),
     ],
 )
 def test_a_line_of_another_unit_than_the_calibrations_is_no_torque(calibration, lines, why):
@@ -242,16 +242,16 @@ def test_a_line_of_another_unit_than_the_calibrations_is_no_torque(calibration, 
 def test_a_corrupted_torque_is_not_called_counts():
     # The paper's corrupted values have no decimal point.
     torques = feed_lines(LoadParser(TORQUE_LINES), ["0.0100", "0.0101", "38399996", "0.0102"])
-    assert [one.other_unit for one in torques] == [""] * 4
+    assert [one.other_unit for one in torques] == [None] * 4
     assert [one.spike for one in torques] == [False, False, True, False]
 
 
 @pytest.mark.parametrize("line", ["0,091", "torque: 0.091", "nan", "", "9" * 40, "\xf8\x80"])
 def test_the_last_refused_line_is_quoted_with_its_reason(line):
     parser = LoadParser(TORQUE_LINES)
-    assert parser.refusal == ""
+    assert parser.refusal is None
     feed_lines(parser, ["0.1", "1.5.5", line])
     assert parser.refused == 2
     kind = "empty" if not line else "too long" if len(line) == 40 else "not a number"
     sent = line.encode() + b"\r" * (kind == "too long")
-    assert parser.refusal == refusal_sentence(sent, kind, "load cell", in_a_row=1)
+    assert parser.refusal == refusal_of(sent, kind, "load cell", in_a_row=1)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.refused_lines import REPEATED, SHOWN_BYTES, refusal_sentence, sender_of, shown
+from shearloop.drivers.refused_lines import REPEATED, SHOWN_BYTES, refusal_of, sender_of, shown
 
 EIT_LINE = b"0.1234, " * 100
 # The line, the board that is expected, who sends it, and a part of the cure.
@@ -39,9 +39,9 @@ def test_a_refused_line_names_its_probable_sender_and_the_cure(line, expected, w
     found_who, found_cure = sender_of(line, expected)
     assert who in found_who
     assert cure in found_cure
-    sentence = refusal_sentence(line, "the reason", expected)
-    assert sentence.endswith(f"; {found_cure}")
-    assert "the reason" in sentence
+    refusal = refusal_of(line, "the reason", expected)
+    assert refusal.cure == found_cure
+    assert "the reason" in refusal.cause
 
 
 @given(st.binary(max_size=2000), st.sampled_from(["EIT-kit", "load cell", "skin's converter board"]))
@@ -49,14 +49,14 @@ def test_any_line_is_quoted_short_and_printable(line, expected):
     quoted = shown(line)
     assert set(quoted) <= {*string.printable, "…"} - {*"\n\r\t\x0b\x0c"}
     assert len(quoted) <= 4 * SHOWN_BYTES + 3
-    sentence = refusal_sentence(line, "no number", expected)
+    sentence = refusal_of(line, "no number", expected).clause
     assert len(sentence) < 500
     assert sentence.startswith("refused ")
 
 
 def test_a_single_refused_line_accuses_no_other_board():
     """Half of a converter board's line looks like a load cell's."""
-    sentence = refusal_sentence(b"0.126000", "not a number", "skin's converter board", in_a_row=1)
+    sentence = refusal_of(b"0.126000", "not a number", "skin's converter board", in_a_row=1).clause
     assert "load cell" not in sentence
     assert sentence.startswith("refused '0.126000': not a number. A single line like this has lost bytes on its way")
-    assert "load cell" in refusal_sentence(b"0.126000", "not a number", "skin's converter board", in_a_row=REPEATED)
+    assert "load cell" in refusal_of(b"0.126000", "not a number", "skin's converter board", in_a_row=REPEATED).cause

@@ -7,7 +7,7 @@ from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import DaemonConfig, SerialDevice
 from shearloop.drivers.ranges import LARGEST_PAYLOAD_KG
 from shearloop.drivers.ur.control_box import ControllerInfo, untested
-from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_sentence, tool_difference
+from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_by, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import InstalledTool, UrSettings
 from shearloop.tools.commission.context import Context
@@ -57,7 +57,7 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
     """Return the stage's lines: versions and modes are known, payload and tool centre point are as in the settings."""
     outputs, tool, seen = identity.outputs, settings.tool, identity.controller
     major = int(seen.version.split(".", maxsplit=1)[0])
-    slowed = slowed_sentence(outputs)
+    slowed = slowed_by(outputs)
     lines = [
         _polyscope(seen.version),
         judged(
@@ -70,7 +70,13 @@ def judge_identity(identity: Identity, settings: UrSettings, config: DaemonConfi
         judged("robot mode", seen.robot_mode, "RUNNING", "ready to move", passed=seen.robot_mode == "RUNNING"),
         judged("safety mode", seen.safety_mode, "NORMAL", "ready to move", passed=seen.safety_mode == "NORMAL"),
         *_other_programs(seen, outputs),
-        judged("speed slider", slowed or f"{outputs.speed_slider:.0%}", "100%", "the loop's gain", passed=not slowed),
+        judged(
+            "speed slider",
+            slowed.sentence if slowed else f"{outputs.speed_slider:.0%}",
+            "100%",
+            "the loop's gain",
+            passed=not slowed,
+        ),
         _payload(identity, tool.payload_kg, emulated=config.emulated),
         *_rated(identity, tool.payload_kg),
         judged(
@@ -166,4 +172,4 @@ def _tool_centre(outputs: RtdeOutputs, tool: InstalledTool) -> Line:
         return Line(what=what, value=value)
     differs = tool_difference(outputs, compared)
     limit = "as in the robot's settings; else the daemon refuses motion"
-    return judged(what, differs or value, limit, "positions are of the tool", passed=not differs)
+    return judged(what, differs.sentence if differs else value, limit, "positions are of the tool", passed=not differs)

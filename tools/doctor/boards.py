@@ -20,7 +20,8 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadParser, LoadSample
 from shearloop.drivers.refused_lines import shown
 from shearloop.drivers.serial_sensor import InputKind, Parser, RawEvent
 from shearloop.drivers.shear_skin.instruments import PairParser
-from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
+from shearloop.errors import Hint
+from shearloop.tools.doctor.findings import Finding, from_error, good, note, trouble
 from shearloop.tools.fingertip_table import fingertip_table
 from shearloop.tools.serial_ports import access_error
 from shearloop.words import counted
@@ -46,7 +47,7 @@ class Received(Generic[ValueT]):
     # (monotonic ns, lines) of each read that ended a line, refused lines included.
     lines: list[tuple[int, int]] = field(default_factory=list)
     refused: int = 0
-    refusal: str = ""
+    refusal: Hint | None = None
     # The beginning of a line that did not end.
     unfinished: bytes = b""
     # Why the port was lost while listening; empty where it was not.
@@ -221,9 +222,9 @@ def check_samples(samples: Sequence[LoadSample]) -> Finding:
         found = f"all {n} readings are exactly {last.raw:.10g}"
         cure = "check that the HX711 has power and that its DT and SCK wires are on the pins named in the sketch"
         return trouble(subject, found, "a live converter is never that still", cure)
-    if last.other_unit:
-        what, cure = split_cure(last.other_unit)
-        return trouble(subject, f"the last reading is {last.raw:.10g}", f"{what}, so there is no torque", cure)
+    if last.other_unit is not None:
+        cause, cure = last.other_unit
+        return trouble(subject, f"the last reading is {last.raw:.10g}", f"{cause}, so there is no torque", cure)
     if (spikes := sum(sample.spike for sample in samples)) > 0.5 * n:
         found = f"{spikes} of {counted(n, 'reading')} are beyond the cell's capacity, the last {last.torque_nm:.4g} N·m"
         means = "the calibration is of another cell or another sketch, or its zero has moved"
@@ -248,10 +249,9 @@ async def _receive(
         return [port, from_error(f"lines of {name}", received.loss, "it went while the doctor listened", cure)], None
     if received.values:
         return [port, *_check_refused(name, received)], received
-    if received.refused:
-        what, cure = split_cure(received.refusal)
-        found = f"{counted(received.refused, 'line')} came, and none is of use; {what}"
-        return [port, trouble(f"lines of {name}", found, nothing_read, cure)], None
+    if received.refusal is not None:
+        found = f"{counted(received.refused, 'line')} came, and none is of use; {received.refusal.cause}"
+        return [port, trouble(f"lines of {name}", found, nothing_read, received.refusal.cure)], None
     if received.unfinished:
         found = f"bytes without a line end came: {shown(received.unfinished)}"
         cure = "see whether it is this board: `shearloop ports` lists them; let its program end each line"
@@ -263,13 +263,11 @@ async def _receive(
 
 
 def _check_refused(name: str, received: Received[ValueT]) -> list[Finding]:
-    if not received.refused:
+    if received.refusal is None:
         return []
-    what, cure = split_cure(received.refusal)
     lines = received.refused + len(received.values)
-    found = f"{counted(received.refused, 'line was', 'lines were')} left out of {lines}; {what}"
-    cure = cure or "replace the USB cable, and end other programs that use the board"
-    return [note(f"lines of {name}", found, "the estimates miss these lines", cure)]
+    found = f"{counted(received.refused, 'line was', 'lines were')} left out of {lines}; {received.refusal.cause}"
+    return [note(f"lines of {name}", found, "the estimates miss these lines", received.refusal.cure)]
 
 
 def _check_pace(

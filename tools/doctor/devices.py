@@ -25,7 +25,7 @@ from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.shear_skin.instruments import PolledInstrument
 from shearloop.drivers.ur.control_box import ControllerInfo, check_generation, check_ports, query_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
-from shearloop.drivers.ur.limits import slowed_sentence, tool_difference
+from shearloop.drivers.ur.limits import slowed_by, tool_difference
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.ports import FIELDBUS_MENU
 from shearloop.drivers.ur.primary_port import PrimaryPort
@@ -169,15 +169,13 @@ def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Findi
         cure = "look at the teach pendant, and run the doctor again"
         yield from_error("robot's state", error, "slider, payload and tool are not known", cure)
         return
-    slowed, differs = slowed_sentence(outputs), tool_difference(outputs, settings.tool)
-    if slowed:
-        what, _, cure = slowed.partition(": ")
-        yield trouble("speed slider", what, means, cure.rstrip("."))
+    slowed, differs = slowed_by(outputs), tool_difference(outputs, settings.tool)
+    if slowed is not None:
+        yield trouble("speed slider", slowed.cause, means, slowed.cure)
     else:
         yield good("speed slider", f"{outputs.speed_slider:.0%}")
-    if differs:
-        what, _, cure = differs.partition(": ")
-        yield trouble("payload and tool", what, means, cure.rstrip("."))
+    if differs is not None:
+        yield trouble("payload and tool", differs.cause, means, differs.cure)
         return
     unsafe = check_payload(arm, outputs.payload_kg, settings.tool.payload_kg)
     if unsafe is not None:

@@ -25,7 +25,10 @@ good, note, trouble = Finding, partial(Finding, state="note"), partial(Finding, 
 
 
 def split_cure(sentence: str) -> tuple[str, str]:
-    """Return a message without its cure, and the cure: the text after its last `;` or full stop, or nothing."""
+    """Return an error's message or a task's report without its cure, and the cure.
+
+    The cure follows the last `;` or else the last full stop. It is empty where neither is within the message.
+    """
     for mark in ("; ", ". "):
         what, found, cure = sentence.rpartition(mark)
         if found:

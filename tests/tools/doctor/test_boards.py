@@ -209,6 +209,23 @@ async def test_a_few_refused_lines_among_good_ones_are_a_note(rig):
     assert "'0.1234, 0.1'" in found.found
 
 
+@pytest.mark.parametrize(
+    ("value", "cure"),
+    [
+        (b"0; 1. 2", "replace the USB cable if more of them come"),
+        (b"nan", "restart the board so that it calibrates again"),
+    ],
+)
+async def test_what_a_board_sends_is_never_taken_for_the_cure(value, cure, rig):
+    """Marks between cause and cure stood in the quoted bytes."""
+    whole = next(frames())
+    first, rest = whole.split(b", ", 1)
+    assert len(first) == 6
+    found = (await rig(texts(value + b", " + rest)))["lines of right"]
+    assert f"refused {repr(value)[1:]} at value 1: a value that is " in found.found
+    assert found.next_step == cure
+
+
 async def test_bytes_without_a_line_end_are_quoted(rig):
     found = (await rig(texts(b"0.1234, "), seconds=0.2))["lines of right"]
     assert found.state == "trouble"

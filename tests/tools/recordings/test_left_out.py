@@ -40,7 +40,7 @@ def recording(tmp_path):
             stamped = {"t_mono_ns": number * PERIOD_NS, "age_s": 0.27, "repeated": False}
             publish(sample(EitFrame, source=side, **frame, **stamped))
     for number in range(LOADS):
-        reason = {"valid": False, "reason": COUNTS_REASON} if number % 10 == 9 else {"valid": True, "reason": ""}
+        reason = {"valid": False, "reason": COUNTS_REASON.clause} if number % 10 == 9 else {"valid": True, "reason": ""}
         publish(sample(LoadTorque, source="load_cell", t_mono_ns=number * 90_000_000, torque_nm=0.01, **reason))
     recorder.close()
     assert recorder.failure == ""
@@ -52,7 +52,7 @@ def test_readings_and_frames_that_are_not_used_are_counted(recording):
     assert len(both.t_s) == FRAMES - 3
     assert len(both.torque_nm) == LOADS - 10
     loads, repeated, unpaired = both.left_out
-    assert loads == f"10 of 100 readings of the load cell, not valid, e.g. {COUNTS_REASON}"
+    assert loads == f"10 of 100 readings of the load cell, not valid, e.g. {COUNTS_REASON.clause}"
     assert repeated == "1 frame of the left side, repeated by the board"
     assert unpaired == "3 frames of the right side, without one of the others at that time"
     (right,) = read_series(recording, ("right",))

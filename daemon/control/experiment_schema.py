@@ -66,7 +66,9 @@ FingerForce = Annotated[float, Field(ge=FORCES_N.low, le=FORCES_N.high)]
 class ExperimentLimits(ConfigModel):
     """Limits of all steps; a step's limits can only be tighter."""
 
-    torque_nm: ranges.TorqueLimit = Field(default=CAPPED_NM, description="a larger torque stops the motion")
+    torque_nm: ranges.TorqueLimit = Field(
+        default=CAPPED_NM, description="a larger torque stops the experiment, and the gripper opens"
+    )
     angle_rad: ranges.Turn = Field(
         default=3.2, description="largest angle, from the angle at the grip or at the first start with a clamped tool"
     )

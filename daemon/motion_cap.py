@@ -157,7 +157,7 @@ class Commissioning:
         """
         plays = self.emulated or self.rehearsed
         if plays and (reason := why_not_emulated(self.given.host, serial_number)):
-            raise RobotLostError("not-emulated", reason)
+            raise RobotLostError("not-emulated", f"{reason.clause}.")
         if self.report is not None and not self.rehearsed:
             seen = {"polyscope": polyscope, "robot_serial_number": serial_number}
             differs = list(self.report.rig.differences(self.report.rig.model_copy(update=seen)))
@@ -171,13 +171,14 @@ class Commissioning:
         return self.cap.sentence if self.cap is not None else ""
 
 
-def why_not_emulated(host: str, robot_serial_number: str) -> str:
-    """Return that the controller at an address is no emulated one, by its serial number, or an empty string."""
+def why_not_emulated(host: str, robot_serial_number: str) -> Hint | None:
+    """Return that the controller at an address is no emulated one, by its serial number, and the cure; or None."""
     if robot_serial_number == EMULATED_SERIAL_NUMBER:
-        return ""
-    return (
+        return None
+    return Hint(
         f"The configuration says `emulated: true`, and the controller at {host} is no emulated one: its serial number "
-        f"is {robot_serial_number or 'unknown'}, not {EMULATED_SERIAL_NUMBER}; take `emulated` out for a real robot."
+        f"is {robot_serial_number or 'unknown'}, not {EMULATED_SERIAL_NUMBER}",
+        "take `emulated` out for a real robot",
     )
 
 

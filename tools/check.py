@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.errors import USER_ERRORS
-from shearloop.errors import UserError
+from shearloop.errors import Hint, UserError
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -228,27 +228,27 @@ def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
         if isinstance(section, SerialDevice) and section.path is not None and (kind := _no_port(section.path)):
             parts.mistakes[key] = f"`{key}.path: {section.path}` is {kind}; name a serial port: `shearloop ports`"
     if (recording := config.recording) is not None and (reason := why_not_recorded(recording.folder)):
-        parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {reason}"
+        parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {reason.clause}"
 
 
-def why_not_recorded(folder: Path) -> str:
-    """Return why this user cannot record in a folder that exists or is still to be made, with the cure, or nothing."""
+def why_not_recorded(folder: Path) -> Hint | None:
+    """Return why this user cannot record in a folder that exists or is still to be made, with the cure, or None."""
     try:
         existing = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
         if existing.is_symlink() and not existing.exists():
-            return f"{existing} is a link to {existing.readlink()}, which does not exist; choose another folder"
+            return Hint(f"{existing} is a link to {existing.readlink()}, which does not exist", "choose another folder")
         if not existing.is_dir():
-            return f"{existing} is a file; name a folder"
+            return Hint(f"{existing} is a file", "name a folder")
         file_system = os.statvfs(existing)
     except OSError as error:
-        return f"{error.filename}: {error.strerror}; choose another folder"
+        return Hint(f"{error.filename}: {error.strerror}", "choose another folder")
     if not os.access(existing, os.W_OK | os.X_OK):
         read_only = file_system.f_flag & os.ST_RDONLY
         why = os.strerror(errno.EROFS if read_only else errno.EACCES)
-        return f"you may not write in {existing} ({why}); choose another folder, or make this one writable"
+        return Hint(f"you may not write in {existing} ({why})", "choose another folder, or make this one writable")
     if not file_system.f_bavail:
-        return f"the disk of {existing} is full; free some space, or choose another folder"
-    return ""
+        return Hint(f"the disk of {existing} is full", "free some space, or choose another folder")
+    return None
 
 
 def _no_port(path: Path) -> str:

@@ -83,7 +83,7 @@ def commission(
         devices = rig or ConnectedRig(config, settings)
         controller = devices.controller()
         if config.emulated and (reason := why_not_emulated(settings.host, controller.serial_number)):
-            raise UserError(reason)
+            raise UserError(f"{reason.clause}.")
         begun = earlier.rig if earlier is not None else None
         rig_identity = identity_of(config, controller.version, controller.serial_number, begun)
         report = report_for(rig_identity, earlier, out)

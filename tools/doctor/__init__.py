@@ -181,7 +181,7 @@ def check_disk(folder: Path) -> Finding:
 def check_recording(folder: Path) -> Finding:
     """Check that the daemon can record in a folder, and the space for it."""
     if reason := why_not_recorded(folder):
-        return from_error("disk", reason, "the daemon does not start")
+        return trouble("disk", reason.cause, "the daemon does not start", reason.cure)
     return check_disk(folder)
 
 

@@ -122,7 +122,7 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
         yield from_error("robot", error, "the robot cannot be driven", cure)
         return
     if config.emulated and (reason := why_not_emulated(host, seen.serial_number)):
-        yield from_error("robot", reason, "the daemon does not drive it")
+        yield trouble("robot", reason.cause, "the daemon does not drive it", reason.cure)
         return
     with contextlib.closing(PrimaryPort(host, ROBOT_TIMEOUT_S)) as primary:
         missing = primary.missing

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
+from shearloop.daemon.torques import BOTH_DIRECTIONS, Direction
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.models import ModelName
@@ -46,7 +47,8 @@ def new_report(file: str = "NEW_FILE", *, emulated: bool = False) -> str:
 class MotionCap:
     """The largest speeds and torque that a rig's report allows, why no larger ones, and what raises them.
 
-    An experiment that one of `torque_sources` drives may have `torque_nm`, and any other one `CAPPED_NM`.
+    A step may have `torque_nm` if one of `torque_sources` drives its experiment, and if it loads the tool in
+    `torque_directions` alone. Any other step may have `CAPPED_NM`.
     """
 
     why: str
@@ -55,10 +57,12 @@ class MotionCap:
     linear_speed_m_per_s: float = CAPPED_M_PER_S
     torque_nm: float = CAPPED_NM
     torque_sources: tuple[str, ...] = ()
+    torque_directions: frozenset[Direction] = BOTH_DIRECTIONS
 
-    def torque_nm_of(self, source: str) -> float:
-        """Return the largest torque of an experiment that this source drives."""
-        return self.torque_nm if source in self.torque_sources else CAPPED_NM
+    def torque_nm_of(self, source: str, directions: frozenset[Direction] = BOTH_DIRECTIONS) -> float:
+        """Return the largest torque of a step that loads the tool in these directions, driven by this source."""
+        is_measured = source in self.torque_sources and directions <= self.torque_directions
+        return self.torque_nm if is_measured else CAPPED_NM
 
     @property
     def sentence(self) -> str:
@@ -68,11 +72,21 @@ class MotionCap:
     @property
     def cause(self) -> str:
         """Return the cap in words, without its cure."""
-        sources = f" ({', '.join(self.torque_sources)}; any other source {CAPPED_NM:g} N·m)"
         return (
             f"the robot is capped at {self.wrist_speed_rad_per_s:g} rad/s, {self.linear_speed_m_per_s:g} m/s and "
-            f"{self.torque_nm:g} N·m{sources if self.torque_sources else ''}: {self.why}"
+            f"{self.torque_nm:g} N·m{self._raised_for}: {self.why}"
         )
+
+    @property
+    def _raised_for(self) -> str:
+        """For which sources and directions the torque is raised, in words."""
+        if not self.torque_sources:
+            return ""
+        sources = ", ".join(self.torque_sources)
+        if self.torque_directions == BOTH_DIRECTIONS:
+            return f" ({sources}; any other source {CAPPED_NM:g} N·m)"
+        (direction,) = self.torque_directions
+        return f" ({sources}, {direction} alone; else {CAPPED_NM:g} N·m)"
 
 
 @dataclass(slots=True)
@@ -81,7 +95,7 @@ class Commissioning:
 
     `reason` says why the report raises nothing, and what helps. It is None for a report that counts. `emulated` means
     a robot without a cap, `rehearsed` an emulated robot with the cap of the real one. The report raises the torque of
-    `torque_sources`.
+    `torque_sources`, in the directions that its stage measured.
     """
 
     given: UrSettings
@@ -90,6 +104,7 @@ class Commissioning:
     emulated: bool = False
     rehearsed: bool = False
     torque_sources: tuple[str, ...] = ()
+    torque_directions: frozenset[Direction] = BOTH_DIRECTIONS
     # How the connected controller differs from the report's.
     _other: Hint | None = field(default=None, init=False)
 
@@ -112,6 +127,7 @@ class Commissioning:
             wrist_speed_rad_per_s=max(CAPPED_RAD_PER_S, wrist_rad_per_s or 0.0),
             torque_nm=max(CAPPED_NM, torque_nm),
             torque_sources=self.torque_sources if torque_nm > CAPPED_NM else (),
+            torque_directions=self.torque_directions,
         )
 
     @property

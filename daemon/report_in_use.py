@@ -4,7 +4,7 @@ from datetime import UTC, datetime
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.motion_cap import Commissioning
-from shearloop.daemon.torques import LOAD_CELL
+from shearloop.daemon.torques import BOTH_DIRECTIONS, LOAD_CELL
 from shearloop.drivers.ur.settings import UrSettings
 
 
@@ -27,4 +27,9 @@ def commissioning_of(config: DaemonConfig, settings: UrSettings, now: datetime |
     measured = {} if reason else report.supplied().torque_sources or {}
     # After another calibration, sign and scale are not known.
     same = (name for name, own in sorted(measured.items()) if source_sha256(config, name) == own)
-    return Commissioning(settings, report, reason, rehearsed=rehearsed, torque_sources=(LOAD_CELL, *same))
+    # Stage 7 measures what the load cell does; another `load_cell.direction` makes it old.
+    cell = config.real.load_cell
+    directions = BOTH_DIRECTIONS if cell is None or cell.direction is None else frozenset({cell.direction})
+    return Commissioning(
+        settings, report, reason, rehearsed=rehearsed, torque_sources=(LOAD_CELL, *same), torque_directions=directions
+    )

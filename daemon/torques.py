@@ -30,6 +30,7 @@ WRENCH, LOAD_CELL = "wrench", "load_cell"
 Direction = Literal["clockwise", "counterclockwise"]
 # One convention for every number of a file, and for recorded angles and torques.
 SIGNS: Mapping[Direction, int] = {"clockwise": -1, "counterclockwise": 1}
+BOTH_DIRECTIONS: frozenset[Direction] = frozenset(SIGNS)
 
 
 def direction_of(number: float) -> Direction | None:

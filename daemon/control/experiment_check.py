@@ -26,7 +26,7 @@ from shearloop.daemon.control.experiment_schema import (
 )
 from shearloop.daemon.control.step_demands import demand
 from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
-from shearloop.daemon.torques import LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
+from shearloop.daemon.torques import BOTH_DIRECTIONS, LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 from shearloop.estimation import Measured
@@ -50,20 +50,36 @@ def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[
     if driving.name == LOAD_CELL:
         why = "its lever presses the other way alone, by `load_cell.direction`; turn that way"
     for number, step in enumerate(file.steps):
-        turned: set[Direction | None] = set()
-        match step:
-            case HoldTorqueStep(signed_torque_nm=torque_nm):
-                turned = {direction_of(torque_nm)}
-            case TightenStep(direction=direction):
-                turned = {direction}
-            case TwistStep(absolute=False, angles_rad=angles_rad):
-                turned = {direction_of(angle_rad) for angle_rad in angles_rad}
-        if other is not None and other in turned:
+        turned = _loads(step)
+        if other is not None and turned is not None and other in turned:
             yield (
                 number,
                 f"{step.do} turns {other}, and {driving.name} measures no torque of this direction: {why}, or let "
                 "another source drive",
             )
+
+
+def _loads(step: Step) -> frozenset[Direction] | None:
+    """Return the directions in which a step loads the tool; None where the angle before decides it."""
+    directions: set[Direction | None] = set()
+    match step:
+        case HoldTorqueStep(signed_torque_nm=torque_nm):
+            directions = {direction_of(torque_nm)}
+        case TightenStep(direction=direction):
+            directions = {direction}
+        case IdentifyStep():
+            directions = {"counterclockwise"}
+        case TwistStep(absolute=False, angles_rad=angles_rad):
+            directions = {direction_of(angle_rad) for angle_rad in angles_rad}
+        case TwistStep():
+            return None
+    return frozenset(direction for direction in directions if direction is not None)
+
+
+def _capped_nm(file: ExperimentFile, step: Step, cap: MotionCap) -> float:
+    """Return the largest torque limit of a step; where its direction is not known, that of both directions."""
+    directions = _loads(step)
+    return cap.torque_nm_of(file.torque_source, BOTH_DIRECTIONS if directions is None else directions)
 
 
 def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mistake]:
@@ -81,7 +97,7 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
             if value >= limit:
                 asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
                 cure = f"raise limits.{key}, or ask for less"
-                if cap is not None and unit == "N·m" and limit + _ROUNDING >= cap.torque_nm_of(file.torque_source):
+                if cap is not None and unit == "N·m" and limit + _ROUNDING >= _capped_nm(file, step, cap):
                     cure = f"ask for less, because {cap.sentence}"
                 found.append((("steps", number), f"{asks}; {cure}"))
         if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
@@ -157,7 +173,7 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
     )
     asked = [(key, getattr(step, key), most, unit) for key, most, unit in speeds if hasattr(step, key)]
     if isinstance(step, TwistingStep):
-        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, cap.torque_nm_of(file.torque_source), "N·m"))
+        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, _capped_nm(file, step, cap), "N·m"))
     for key, value, most, unit in asked:
         # An infinite value stands for one that could not be read.
         if most + _ROUNDING < value < math.inf:

@@ -429,6 +429,32 @@ def test_an_experiment_that_twists_away_from_a_one_way_lever_is_refused(tmp_path
     assert ("turns clockwise, and load_cell measures no torque" in capsys.readouterr().err) == (status == 2)
 
 
+@pytest.mark.parametrize(
+    ("step", "status"),
+    [
+        ({"do": "twist", "angles_rad": [0.1]}, 0),
+        ({"do": "twist", "angles_rad": [0.1, -0.1]}, 2),
+        ({"do": "twist", "angles_rad": [0.1], "absolute": True}, 2),
+        ({"do": "tighten", "until_torque_nm": 0.32, "until_angle_rad": 0.5, "direction": "counterclockwise"}, 0),
+        ({"do": "tighten", "until_torque_nm": 0.32, "until_angle_rad": 0.5, "direction": "clockwise"}, 2),
+    ],
+)
+def test_a_one_way_lever_raises_the_torque_of_its_direction_alone(tmp_path, capsys, step, status):
+    """The wrench measures both directions, but stage 7 compared one of them."""
+    one_way = {"load_cell": {"device": {"serial_number": "7583"}, "direction": "counterclockwise"}}
+    supplies = SUPPLIED.model_copy(update={"torque_sources": {"wrench": ""}})
+    report = report_of(write_rig(tmp_path, **one_way), "013457", supplies)
+    dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
+    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    rig = write_rig(tmp_path, commissioned="report.yaml", **one_way)
+    path = tmp_path / "one.yaml"
+    content = {"name": "one", "torque_source": "wrench", "limits": {"torque_nm": 0.35}, "steps": [step]}
+    path.write_text(yaml.safe_dump(content))
+    assert main(["check", str(path), "--config", str(rig)]) == status
+    refused = capsys.readouterr().err
+    assert ("0.4 N·m (load_cell, wrench, counterclockwise alone; else 0.3 N·m)" in refused) == (status == 2)
+
+
 def test_a_default_that_is_written_out_keeps_the_report(tmp_path):
     plain = identity_of(load_daemon_config(write_rig(tmp_path)), VERSION, SERIAL)
     written = {"load_cell": {"device": {"serial_number": "7583"}, "rate_hz": 10.9}}

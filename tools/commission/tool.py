@@ -12,8 +12,9 @@ from shearloop.daemon.motion_cap import CAPPED_NM
 from shearloop.daemon.rig import gels_of
 from shearloop.daemon.rig_identity import source_sha256
 from shearloop.daemon.supplied_values import Supplied
-from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, direction_of
+from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, Direction, direction_of
 from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.ranges import LARGEST_TORQUE_NM
 from shearloop.drivers.ur.poses import tool_axis
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import Arrivals
@@ -114,18 +115,32 @@ def measure(context: Context) -> Measured:
     lines += [*turned, *judge_twists(held, spring, way), *scales]
     delay_s = statistics.median(delays_s)
     lines.append(Line(what="torque behind the angle", value=f"{1e3 * delay_s:.0f} ms (median)", count=len(delays_s)))
-    largest_nm = round(max(abs(hold.load_nm - held[0].load_nm) for hold in held), 4)
     if has_failed(lines):
         return Measured(lines)
-    lines.append(raised_line(largest_nm, right))
+    largest_nm = min(LARGEST_TORQUE_NM, round(covered_nm(held, way), 4))
+    lines.append(raised_line(largest_nm, right, cell.direction))
     hashes = {name: source_sha256(context.config, name) for name in right}
     sources = {name: own for name, own in hashes.items() if own is not None}
-    return Measured(lines, Supplied(torque_nm=largest_nm, torque_sources=sources))
+    return Measured(lines, Supplied(torque_nm=largest_nm or None, torque_sources=sources))
 
 
-def raised_line(largest_nm: float, right: Sequence[str]) -> Line:
-    """Return the line on the torque that the report allows, and of which sources."""
-    value = f"up to {largest_nm:.3f} N·m of {' and '.join([LOAD_CELL, *right])}; any other source {CAPPED_NM:g} N·m"
+def covered_nm(held: Sequence[Held], way: int = 0) -> float:
+    """Return the largest torque that the twists reached; of both directions if `way`, the only one, is 0."""
+    first, *twisted = held[:-1]
+    ways = (1, -1) if way == 0 else (way,)
+    return min(_largest_nm(first, twisted, one) or 0.0 for one in ways)
+
+
+def _largest_nm(first: Held, twisted: Sequence[Held], way: int) -> float | None:
+    """Return the largest torque of the twists of one direction, or None without a twist."""
+    return max((abs(hold.load_nm - first.load_nm) for hold in _of_way([first, *twisted], way)[1:]), default=None)
+
+
+def raised_line(largest_nm: float, right: Sequence[str], direction: Direction | None = None) -> Line:
+    """Return the line on the torque that the report allows, of which sources, and in which only `direction`."""
+    sources, way = " and ".join([LOAD_CELL, *right]), f", {direction} alone" if direction is not None else ""
+    other = "any other source" if direction is None else "else"
+    value = f"up to {largest_nm:.3f} N·m of {sources}{way}; {other} {CAPPED_NM:g} N·m"
     if largest_nm <= CAPPED_NM:
         value = (
             f"not raised: the twists reached {largest_nm:.3f} N·m, and {CAPPED_NM:g} N·m need no report; "
@@ -340,11 +355,7 @@ def judge_twists(held: Sequence[Held], spring: float, way: int = 0) -> list[Line
 
 def _one_way_only(first: Held, twisted: Sequence[Held]) -> str:
     """Return that the load cell shows the twists of one direction alone, with the cure, or an empty string."""
-    largest_nm = {
-        way: max((abs(hold.load_nm - first.load_nm) for hold in _of_way([first, *twisted], way)[1:]), default=None)
-        for way in (1, -1)
-    }
-    up_nm, down_nm = largest_nm[1], largest_nm[-1]
+    up_nm, down_nm = (_largest_nm(first, twisted, way) for way in (1, -1))
     if up_nm is None or down_nm is None or min(up_nm, down_nm) > _ONE_WAY * max(up_nm, down_nm):
         return ""
     direction = direction_of(1 if up_nm > down_nm else -1)

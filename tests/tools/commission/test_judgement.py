@@ -42,7 +42,7 @@ from shearloop.tools.commission.tap import (
     skin_step_s,
     why_hidden,
 )
-from shearloop.tools.commission.tool import Held, judge_scales, judge_signs, judge_twists, raised_line
+from shearloop.tools.commission.tool import Held, covered_nm, judge_scales, judge_signs, judge_twists, raised_line
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from shearloop.tools.commission.wrench import (
     LARGEST_KG,
@@ -410,6 +410,18 @@ def test_the_sources_with_the_right_scale_are_named_and_a_wrong_one_fails_nothin
 def test_the_stage_says_which_torque_is_raised_and_of_what():
     assert "up to 0.540 N·m of load_cell and right; any other source 0.3 N·m" in raised_line(0.54, ["right"]).value
     assert "not raised: the twists reached 0.064 N·m" in raised_line(0.064, []).value
+    one_way = raised_line(0.54, ["right"], "clockwise").value
+    assert "up to 0.540 N·m of load_cell and right, clockwise alone; else 0.3 N·m" in one_way
+
+
+def test_the_covered_torque_was_reached_in_each_direction_that_is_raised():
+    slipped = [dataclasses.replace(one, load_nm=max(one.load_nm, -0.02)) for one in held(0.8)]
+    assert (covered_nm(slipped), covered_nm(slipped, 1)) == (pytest.approx(0.02), pytest.approx(0.064))
+    pressed = [
+        dataclasses.replace(one, load_nm=-one.load_nm * 2 if one.wrist_rad < 0 else one.load_nm) for one in held(0.8)
+    ]
+    assert covered_nm(pressed, 1) == pytest.approx(0.064), "what a lever reads in the other direction is no measurement"
+    assert covered_nm(held(0.8)[:2] + held(0.8)[-1:]) == 0.0, "one twist covers one direction"
 
 
 @pytest.mark.parametrize("period_s", [0.008, 0.09, 0.3])

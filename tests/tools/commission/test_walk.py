@@ -39,7 +39,7 @@ FEW = replace(
     exchanges=5,
     starts=1,
     frames=6,
-    twists=1,
+    twists=2,
 )
 SPRING_NM_PER_RAD = 5.0
 FAST = {

@@ -13,7 +13,7 @@ from shearloop.daemon.commissioning_report import Line
 from shearloop.daemon.config import DaemonConfig, SkinConfig
 from shearloop.daemon.sensing.skin_task import tool_radius_m
 from shearloop.drivers.eit_kit import Frame
-from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.load_cell import CAPACITY_NM, LoadSample
 from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import load_calibration
@@ -281,7 +281,7 @@ def _weigh(context: Context, load: Arrivals[LoadSample], rate_hz: float) -> list
     rest = load.take(LOAD_SAMPLES, SILENT_S)
     known_nm = operator.number(
         "Load the lever with a known torque and let it rest; its size in N·m (mass × 9.81 × arm)",
-        *(_MIN_NM, 5.0),
+        *(_MIN_NM, CAPACITY_NM),
         Played("the torque that you type is put on it for you, for instance 0.1", ("weigh {}",)),
     )
     loaded = load.take(LOAD_SAMPLES, SILENT_S)

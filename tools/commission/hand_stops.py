@@ -26,8 +26,10 @@ _CONNECTED_WITHIN_S: Final = 20.0
 INTERRUPTED_NS: Final = 500_000_000
 # The wrist turned at the stop if it had half of its speed within this time before; at each end of its way it stands.
 _TURNED_WITHIN_NS: Final = 500_000_000
-# At this fraction of the asked speed the wrist turned at it.
-_AT_SPEED: Final = 0.9
+# Speeds that count are rounded down to this many parts of 1 rad/s.
+_PARTS: Final = 100
+# Of a floating-point number of parts.
+_ROUNDING: Final = 1e-6
 # How often the operator is asked for a stop, if it is not seen.
 _TRIES: Final = 3
 
@@ -58,12 +60,14 @@ class HandStop:
     safety_mode: int
     refusal: str = ""
 
-    @property
-    def stopped_rad_per_s(self) -> float:
-        """The speed that was really stopped: the asked one within the noise, else the speed before the stop."""
-        if self.rad_per_s >= _AT_SPEED * self.asked_rad_per_s:
+    def stopped_rad_per_s(self, noise_rad_per_s: float) -> float:
+        """Return the speed that was really stopped: the asked one within the noise, else the speed before the stop.
+
+        The speed before the stop is rounded down, because no faster turn was stopped.
+        """
+        if self.rad_per_s >= self.asked_rad_per_s - noise_rad_per_s:
             return self.asked_rad_per_s
-        return math.floor(100.0 * self.rad_per_s) / 100.0
+        return math.floor(_PARTS * self.rad_per_s + _ROUNDING) / _PARTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,7 +183,9 @@ def stops_of_layer(context: Context, layer: Layer, speeds: Sequence[float]) -> t
     unseen = "" if len(stops) == len(speeds) else layer.unseen
     longest_s, rehearsed = context.limits.rest_s(context.settings), context.limits.rehearsed
     line = judge_hand_stops(layer.what, stops, len(speeds), longest_s, unseen, rehearsed=rehearsed)
-    stopped_rad_per_s = max((stop.stopped_rad_per_s for stop in stops), default=0.0)
+    # Up to this speed an arm counts as at rest, so a measured speed is no more exact.
+    noise_rad_per_s = context.settings.rest_rad_per_s
+    stopped_rad_per_s = max((stop.stopped_rad_per_s(noise_rad_per_s) for stop in stops), default=0.0)
     return line, max((stop.rad for stop in stops), default=0.0), stopped_rad_per_s
 
 

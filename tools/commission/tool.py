@@ -1,5 +1,6 @@
 """Stage 7: a tool on a known spring: signs, stiffness, delay, slip, and the repeatability of a grip."""
 
+import math
 import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -13,7 +14,7 @@ from shearloop.daemon.rig import gels_of
 from shearloop.daemon.rig_identity import source_sha256
 from shearloop.daemon.supplied_values import Supplied
 from shearloop.daemon.torques import LOAD_CELL, SIGNS, WRENCH, Direction, direction_of
-from shearloop.drivers.load_cell import LoadSample
+from shearloop.drivers.load_cell import CAPACITY_NM, LoadSample
 from shearloop.drivers.ranges import LARGEST_TORQUE_NM
 from shearloop.drivers.ur.poses import tool_axis
 from shearloop.errors import UserError
@@ -31,6 +32,9 @@ from shearloop.tools.commission.wrench import read
 
 STAGE: Final = "7 tool and spring"
 STIFFNESS_TOLERANCE: Final = 0.1
+# The range of the spring's stiffness in N·m/rad. A stiffer one takes the load cell beyond its capacity.
+_SOFTEST: Final = 0.05
+_STIFFEST: Final = math.floor(CAPACITY_NM / TURN_RAD)
 # The torque that remains after the twists, as a fraction of the largest torque.
 LARGEST_SLIP: Final = 0.15
 REPEATS_MM: Final = 1.0
@@ -97,7 +101,7 @@ def measure(context: Context) -> Measured:
         return Measured([Line(what="tool and spring", value="not measured: no load cell is configured")])
     spring = context.operator.number(
         "Mount the tool on a spring of known stiffness; stiffness of spring and pads together in N·m/rad",
-        *(0.05, 50.0),
+        *(_SOFTEST, _STIFFEST),
         Played(
             "it is mounted for you on a spring as stiff as you type, for instance 0.8",
             (*put_between(context).commands, "spring {}"),

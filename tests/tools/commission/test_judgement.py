@@ -165,9 +165,12 @@ def test_a_rehearsed_stop_is_no_measurement():
     assert "0.0200 rad" not in line.value
 
 
-@pytest.mark.parametrize(("rad_per_s", "stopped"), [(0.47, 0.5), (0.449, 0.44), (0.29, 0.29), (0.03, 0.03)])
+@pytest.mark.parametrize(
+    ("rad_per_s", "stopped"),
+    [(0.51, 0.5), (0.495, 0.5), (0.47, 0.47), (0.45, 0.45), (0.449, 0.44), (0.29, 0.29), (0.03, 0.03)],
+)
 def test_a_stop_by_hand_counts_for_the_speed_that_it_stopped(rad_per_s, stopped):
-    assert dataclasses.replace(HAND, rad_per_s=rad_per_s).stopped_rad_per_s == pytest.approx(stopped, abs=0.01)
+    assert dataclasses.replace(HAND, rad_per_s=rad_per_s).stopped_rad_per_s(0.01) == stopped
 
 
 HAND = HandStop(0.5, 0.47, 0.05, 0.02, 1)

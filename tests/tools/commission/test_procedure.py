@@ -143,6 +143,9 @@ def test_the_whole_procedure_runs_unattended_and_its_report_supplies_what_it_mea
     assert [stage.stage for stage in report.stages] == list(STAGES)
     assert sum("Listening" in line for line in lab.operator.said) == 1, "a stage that passed is not run again"
     assert "Ada" in page.read_text()
+    for question, range_of_answers in (("known torque", "(0.02 to 1.75)"), ("known stiffness", "(0.05 to 21)")):
+        asked = [one for one in lab.operator.asked if question in one]
+        assert any(range_of_answers in one for one in asked), "nothing beyond the load cell's capacity is asked for"
     content = yaml.safe_load(lab.path.read_text())
     lab.path.write_text(yaml.safe_dump({**content, "commissioned": "report.yaml"}))
     config = load_daemon_config(lab.path)

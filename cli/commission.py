@@ -47,11 +47,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the stages, and write report and page."""
+    import logging
     from dataclasses import replace
 
     from shearloop.cli.held_address import held_from_daemons
     from shearloop.cli.terminal import print_result
     from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.logs import logging_to_stderr
     from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
@@ -63,6 +65,8 @@ def run(args: argparse.Namespace) -> int:
     label = f"{EMULATED}: " if args.emulate or config.emulated else ""
     terminal = Terminal(sys.stderr if args.json else sys.stdout, label)
     with ExitStack() as emulating:
+        # The lines say what matters here, and a log would stand between questions.
+        emulating.enter_context(logging_to_stderr(level=logging.ERROR))
         order = None
         if args.emulate:
             config, devices = emulating.enter_context(_emulated(config, args.config, terminal))

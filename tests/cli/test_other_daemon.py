@@ -2,6 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
+from socket import AF_UNIX, SOCK_DGRAM, socket
 from unittest.mock import Mock
 
 import pytest
@@ -9,9 +10,13 @@ import pytest
 from shearloop.cli import demo, other_daemon
 from shearloop.cli.held_address import held_from_daemons
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.messaging.addresses import stop_name
+from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
+from shearloop.daemon.messaging.stop_client import send_to_stop_socket
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.errors import UserError
+from tests.fixtures.daemons import DEADLINE_S
 
 RUNNING = {"process": 4711, "folder": "/home/ann/demo", "rig": "demo"}
 NAMED = r"process 4711 \(demo\) in /home/ann/demo"
@@ -71,3 +76,23 @@ def test_no_daemon_and_no_second_command_begins_while_a_command_holds_the_addres
         with pytest.raises(UserError, match="process 7"), held_from_daemons(commands, "another"):
             pass
     StopSocket(commands, {}, Refusals()).close()
+
+
+def test_a_held_address_answers_after_an_empty_datagram_and_beside_a_client_that_does_not_read(tmp_path):
+    commands = f"ipc://{tmp_path}/held"
+    waiting = int(Path("/proc/sys/net/unix/max_dgram_qlen").read_text())
+    with held_from_daemons(commands, "process 7 has the robot"), socket(AF_UNIX, SOCK_DGRAM) as client:
+        client.settimeout(DEADLINE_S)
+        # Without a name, as `socat` sends it.
+        client.sendto(b"", stop_name(commands))
+        client.bind("")
+        for _ in range(waiting + 2):
+            client.sendto(encode({"command": "stop"}), stop_name(commands))
+        reply = send_to_stop_socket(commands, {"command": "status"}, DEADLINE_S)
+        assert (reply["ok"], reply["reason"]) == (False, "process 7 has the robot")
+
+
+def test_a_held_address_answers_for_itself_alone():
+    """Another address may have the same port, and its daemon is another one."""
+    with held_from_daemons("tcp://127.0.0.1:5999", "process 7 has the robot"):
+        assert send_to_stop_socket("tcp://127.0.0.2:5999", {"command": "status"}, DEADLINE_S) is None

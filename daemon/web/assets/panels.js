@@ -112,7 +112,8 @@ function otherFigure(link, other) {
   const old = link.isOld(other.message);
   put(byId("other-source"), other.name);
   figure("other-torque", other.valid ? link.number(other.message, "torque_nm", 4, SIGNED) : "–", old);
-  put(byId("other-note"), old ? oldNote(link, other.message) : other.valid ? "" : "not valid");
+  const note = other.valid ? "" : "not valid";
+  put(byId("other-note"), old ? oldNote(link, other.message) : note);
 }
 
 function diameterFigure(link, estimate) {
@@ -316,7 +317,10 @@ export function healthPanel(link, drawn) {
   const named = (state) => tasks.filter((task) => task.state === state).map((task) => task.name).join(", ");
   const [dead, warned] = [named("dead"), named("warned")];
   const trouble = [dead && `✗ DEAD: ${dead}`, warned && `! errors: ${warned}`].filter(Boolean).join("; ");
-  byId("health").dataset.state = dead ? "dead" : warned || old ? "warned" : "alive";
+  let state = "alive";
+  if (dead) state = "dead";
+  else if (warned || old) state = "warned";
+  byId("health").dataset.state = state;
   const lateOnes = old && `! old data: ${old}`;
   put(byId("tasks-line"), !said || link.isOld(message) ? "not known" : trouble || lateOnes || `✓ all ${tasks.length} are well`);
   put(byId("trouble"), trouble);
@@ -344,7 +348,8 @@ function taskOf(name, facts) {
   if (dead) [state, text] = ["dead", `✗ ${name}: DEAD`];
   else if (facts.done) [state, text] = ["done", `✓ ${name}: done`];
   else if (facts.error) [state, text] = ["warned", `! ${name}: error`];
-  const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
+  const expected = facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`;
+  const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${expected} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
   const restarts = facts.restarts ? `restarted ${facts.restarts === 1 ? "once" : `${facts.restarts} times`}` : "";
   const report = [rate, errors && `errors: ${errors}`, restarts, error].filter(Boolean).join("; ") || "no errors";

@@ -91,18 +91,7 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
     found: list[Mistake] = list(_undoing(file))
     identified = gripped = False
     for number, step in enumerate(file.steps):
-        limits, needs = file.limits_of(step), demand(step)
-        torque = needs.torque_nm, limits.torque_nm, "N·m", "torque_nm"
-        for value, limit, unit, key in (torque, (needs.angle_rad, limits.angle_rad, "rad", "angle_rad")):
-            if value >= limit:
-                asks = f"{step.do} asks for {value:g} {unit}, and its limit is {limit:g} {unit}"
-                cure = f"raise limits.{key}, or ask for less"
-                if cap is not None and unit == "N·m" and limit + _ROUNDING >= _capped_nm(file, step, cap):
-                    cure = f"ask for less, because {cap.sentence}"
-                found.append((("steps", number), f"{asks}; {cure}"))
-        if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
-            asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
-            found.append((("steps", number), f"{asks}; raise timeout_s"))
+        found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, cap)]
         if isinstance(step, GripperStep):
             gripped = isinstance(step, GripStep) and step.expect_object
         if gripped and isinstance(step, TareStep):
@@ -119,6 +108,23 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
                 # One sentence is enough.
                 identified = True
     return found
+
+
+def _beyond_own_limits(file: ExperimentFile, step: Step, cap: MotionCap | None) -> Iterator[str]:
+    """Yield what a step asks for beyond its limits and its timeout, each with a cure."""
+    limits, needs = file.limits_of(step), demand(step)
+    if needs.torque_nm >= limits.torque_nm:
+        cure = "raise limits.torque_nm, or ask for less"
+        if cap is not None and limits.torque_nm + _ROUNDING >= _capped_nm(file, step, cap):
+            # A larger limit is refused too.
+            cure = f"ask for less, because {cap.sentence}"
+        yield f"{step.do} asks for {needs.torque_nm:g} N·m, and its limit is {limits.torque_nm:g} N·m; {cure}"
+    if needs.angle_rad >= limits.angle_rad:
+        asks = f"{step.do} asks for {needs.angle_rad:g} rad, and its limit is {limits.angle_rad:g} rad"
+        yield f"{asks}; raise limits.angle_rad, or ask for less"
+    if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
+        asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
+        yield f"{asks}; raise timeout_s"
 
 
 def _forgets_tool(step: Step, torque_source: str) -> bool:
@@ -171,15 +177,20 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
         ("speed_m_per_s", cap.linear_speed_m_per_s, "m/s"),
         ("speed_rad_per_s", cap.wrist_speed_rad_per_s, "rad/s"),
     )
-    asked = [(key, getattr(step, key), most, unit) for key, most, unit in speeds if hasattr(step, key)]
+    for key, most, unit in speeds:
+        if hasattr(step, key) and _is_beyond(getattr(step, key), most):
+            return f"has {key} {getattr(step, key):g} {unit}: write {most:g} or less, because {cap.sentence}"
     if isinstance(step, TwistingStep):
-        asked.append(("limits.torque_nm", file.limits_of(step).torque_nm, _capped_nm(file, step, cap), "N·m"))
-    for key, value, most, unit in asked:
-        # An infinite value stands for one that could not be read.
-        if most + _ROUNDING < value < math.inf:
-            less = f", and ask for less than {most:g} {unit}" if key not in ("speed_m_per_s", "speed_rad_per_s") else ""
-            return f"has {key} {value:g} {unit}: write {most:g} or less{less}, because {cap.sentence}"
+        limit_nm, most_nm = file.limits_of(step).torque_nm, _capped_nm(file, step, cap)
+        if _is_beyond(limit_nm, most_nm):
+            cure = f"write {most_nm:g} or less, and ask for less than {most_nm:g} N·m"
+            return f"has limits.torque_nm {limit_nm:g} N·m: {cure}, because {cap.sentence}"
     return ""
+
+
+def _is_beyond(value: float, most: float) -> bool:
+    """Return whether a value of a file is above a cap; an infinite one stands for one that could not be read."""
+    return most + _ROUNDING < value < math.inf
 
 
 def _outside_robot(step: Step, limits: UrLimits | None) -> str:

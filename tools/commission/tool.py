@@ -303,7 +303,10 @@ def _twists(context: Context, sensors: Sensors) -> tuple[list[Held], list[float]
         torques = [(sample.t_mid_ns, sample.torque_nm) for sample in sensors.load.since(begun_ns)]
         delays_s.append(_middle_s(torques) - _middle_s(angles))
         # One twist each way shows the scale of an estimate, whose frames take long.
-        held.append((_hold_and_feel if number < _FELT else _hold)(context, sensors))
+        if number < _FELT:
+            held.append(_hold_and_feel(context, sensors))
+        else:
+            held.append(_hold(context, sensors))
     _turn(context, 0.0)
     held.append(_hold(context, sensors))
     return held, delays_s

@@ -57,12 +57,17 @@ class StageResult(Record):
     `RigIdentity` has the hashes for all stages.
     """
 
-    stage: str
+    stage: Annotated[str, Field(pattern="^[0-9] ")]
     operator: str
     date: AwareDatetime
     lines: tuple[Line, ...]
     supplies: Supplied = NOTHING_SUPPLIED
     judged_sha256s: Mapping[str, str] = {}
+
+    @property
+    def number(self) -> str:
+        """The figure at the beginning of the stage's name."""
+        return self.stage[0]
 
     @property
     def passed(self) -> bool:
@@ -84,7 +89,7 @@ class Report(Record):
 
     def stage(self, number: str) -> StageResult | None:
         """Return the stage with this figure at the beginning of its name, if it was run."""
-        return next((stage for stage in self.stages if stage.stage.startswith(number)), None)
+        return next((stage for stage in self.stages if stage.number == number), None)
 
     def supplied(self) -> Supplied:
         """Return the values of all stages."""

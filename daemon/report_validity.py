@@ -79,7 +79,7 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> Hint | None:
 
 
 def _measure_again(again: str, stages: Sequence[StageResult]) -> str:
-    return f"{again} --stages {''.join(stage.stage[0] for stage in stages)}`"
+    return f"{again} --stages {''.join(stage.number for stage in stages)}`"
 
 
 def load_report(path: Path) -> Report:

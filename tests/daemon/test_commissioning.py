@@ -174,6 +174,17 @@ def test_a_report_with_a_value_that_no_stage_measures_is_refused(tmp_path, key, 
         load_report(path)
 
 
+@pytest.mark.parametrize("name", ["", "tool and spring"])
+def test_a_stage_without_a_number_is_refused(tmp_path, name):
+    path = tmp_path / "report.yaml"
+    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    written = yaml.safe_load(path.read_text())
+    written["stages"][0]["stage"] = name
+    path.write_text(yaml.safe_dump(written))
+    with pytest.raises(UserError, match="stage"):
+        load_report(path)
+
+
 NEW = "run `shearloop commission CONFIG --out NEW_FILE`, then write `commissioned: NEW_FILE` into the configuration"
 AGAIN = "run `shearloop commission CONFIG --out FILE"
 

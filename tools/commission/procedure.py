@@ -110,10 +110,10 @@ def _without_changed(report: Report, config: DaemonConfig, operator: Operator, o
     """
     for stage, differs in old_stages(report, config):
         changed = " and ".join(differs)
-        if only and stage.stage[0] not in only:
+        if only and stage.number not in only:
             operator.say(
                 f"Stage {stage.stage} judged another value of {changed}. The report raises nothing until it is "
-                f"measured again: `--stages {stage.stage[0]}`."
+                f"measured again: `--stages {stage.number}`."
             )
         else:
             operator.say(f"Stage {stage.stage} is measured again, because {changed} changed.")

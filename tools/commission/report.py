@@ -113,8 +113,8 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
 
 
 def with_stage(report: Report, result: StageResult) -> Report:
-    """Return a report with this result, which replaces an earlier result of the same stage."""
-    others = [stage for stage in report.stages if stage.stage != result.stage]
+    """Return a report with this result, which replaces an earlier result of the same stage, also by another name."""
+    others = [stage for stage in report.stages if stage.number != result.number]
     stages = sorted([*others, result], key=lambda stage: stage.stage)
     return report.model_copy(update={"stages": tuple(stages)})
 

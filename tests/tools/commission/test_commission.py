@@ -192,6 +192,8 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     assert "Not measured" in text
     assert "4 stops" in text
     assert "emulated" not in text.lower()
+    renamed = good.model_copy(update={"stage": "0 robot"})
+    assert with_stage(found, renamed).stages == (renamed,), "the figure names the stage"
 
 
 def stage(verdict: str) -> StageResult:

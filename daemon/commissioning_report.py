@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Final, Literal
 
-from pydantic import AwareDatetime, Field
+from pydantic import AfterValidator, AwareDatetime, Field
 
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Record, Supplied
 
@@ -50,6 +50,12 @@ class Line(Record):
     verdict: Verdict = "noted"
 
 
+def _numbered(name: str) -> str:
+    if not name[:1].isdecimal():
+        raise ValueError("a stage's name begins with its number, as in `7 tool and spring`")
+    return name
+
+
 class StageResult(Record):
     """The lines of one stage, who ran it, and when.
 
@@ -57,7 +63,7 @@ class StageResult(Record):
     `RigIdentity` has the hashes for all stages.
     """
 
-    stage: Annotated[str, Field(pattern="^[0-9] ")]
+    stage: Annotated[str, AfterValidator(_numbered)]
     operator: str
     date: AwareDatetime
     lines: tuple[Line, ...]

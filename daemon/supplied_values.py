@@ -1,9 +1,10 @@
 """The values that a report of a commissioning supplies to the daemon, within the ranges that its stages can measure."""
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from shearloop.drivers import ranges
 from shearloop.drivers.robotiq.models import COUNTS_MAX, LARGEST_STROKE_MM
@@ -16,8 +17,16 @@ FASTEST_RAD_PER_S: Final = 0.5
 _Delay = Annotated[float, Field(ge=0, le=LONGEST_REACTION_S)]
 _Counts = Annotated[float, Field(ge=0, le=COUNTS_MAX)]
 _Width = Annotated[float, Field(gt=0, le=LARGEST_STROKE_MM)]
+
+
+def _valid_sha256(text: str) -> str:
+    if text and re.fullmatch("[0-9a-f]{64}", text) is None:
+        raise ValueError("this is no SHA-256 of 64 hexadecimal digits")
+    return text
+
+
 # Empty for a source whose settings have no hash.
-_Sha256 = Annotated[str, Field(pattern="^([0-9a-f]{64})?$")]
+_Sha256 = Annotated[str, AfterValidator(_valid_sha256)]
 
 
 class Record(BaseModel):

@@ -114,19 +114,22 @@ class SafetyMonitor:
         self._reset_timers()
         for fault in active:
             if fault.rule.stops_at_rest:
-                # One that lasts is one cause.
-                known = self.waiting.faults if self.waiting is not None else ()
-                self._causes += fault.code not in {one.code for one in known}
-                self._join(fault)
+                # One that lasts is one cause, in its first words: while it is unlocked, the robot says how far it is.
+                known = self._waiting_fault(fault.code)
+                self._causes += known is None
+                self._join(known or fault)
         return SafetyDecision(Response.NOTE, active) if self.waiting is None else self._with_stop(self.waiting, active)
 
     def stop(self, fault: Fault) -> None:
         """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
         self._causes += 1
-        waiting = self.waiting.faults if self.waiting is not None else ()
         # A further stop of an arm that stands does not hide what the first one stopped.
-        known = next((one for one in waiting if one.code is fault.code), fault)
-        self._join(known)
+        self._join(self._waiting_fault(fault.code) or fault)
+
+    def _waiting_fault(self, code: FaultCode) -> Fault | None:
+        """Return the fault of this code in the stop that waits."""
+        waiting = self.waiting.faults if self.waiting is not None else ()
+        return next((one for one in waiting if one.code is code), None)
 
     def _join(self, fault: Fault) -> None:
         """Let a fault join the stop that waits, or begin one."""

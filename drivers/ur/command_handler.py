@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 NOT_ENABLED = "Motion has not been enabled since the robot's worker was started: `start` or `unlock` enables it."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program); this takes some seconds."
+PROGRAM_STARTS = "The robot is being made ready (its control program starts); this takes some seconds."
 LEAVING = "The daemon disconnects from the robot: start it again to continue."
 
 
@@ -112,7 +113,7 @@ class CommandHandler:
                 self._recovery.held = self._held_tool
                 return None
             case _ if self._recovery is not None:
-                refusal = BEING_MADE_READY
+                refusal = self._why_blocked
             case Enable() | Unlock():
                 refusal = unfit or self._executor.violation
                 if not refusal:
@@ -217,7 +218,7 @@ class CommandHandler:
     def _why_blocked(self) -> str:
         """Why motion is refused, or the empty string."""
         if self._recovery is not None:
-            return BEING_MADE_READY
+            return BEING_MADE_READY if self._recovery.operator_asked else PROGRAM_STARTS
         return self._why_unsent or self._executor.violation or self._why_not_enabled
 
     @property

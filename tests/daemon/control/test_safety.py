@@ -43,6 +43,16 @@ def test_a_further_stop_by_a_person_keeps_the_cause_of_the_first():
     assert (gate.waiting.causes, gate.stop_number) == ("the operator stopped it: 'hold' was under way", 2)
 
 
+def test_the_cause_of_a_stop_keeps_its_words_while_the_robot_is_made_ready():
+    gate = SafetyMonitor()
+    gate.report([Fault(FaultCode.PROTECTIVE_STOP, "look for its cause")])
+    decision = gate.report([Fault(FaultCode.PROTECTIVE_STOP, "the robot is being made ready")])
+    assert decision.reported[0].detail == "the robot is being made ready", "the present words, while it waits"
+    gate.acknowledge()
+    assert gate.acknowledged is not None
+    assert gate.acknowledged.causes == "the robot is in a protective stop: look for its cause"
+
+
 def test_a_stop_has_a_larger_number_after_each_further_cause_and_not_while_one_lasts():
     gate = SafetyMonitor()
     assert gate.stop_number == 0

@@ -10,7 +10,7 @@ from tests.drivers.ur.handler_bench import POSE, HandlerBench, enabled, turning
 
 def test_nothing_moves_before_it_is_enabled():
     bench = HandlerBench()
-    assert "made ready" in bench.ask(WristSpeed(0.1, 1.0)).refusal
+    assert "being made ready (its control program starts)" in bench.ask(WristSpeed(0.1, 1.0)).refusal, "no power"
     bench.run(5)
     assert "not been enabled" in bench.ask(WristSpeed(0.1, 1.0)).refusal
     assert "not been enabled" in bench.ask(MoveLinear(POSE, 0.1, 0.1)).refusal

@@ -56,7 +56,7 @@ UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standa
   error-code CODE         report an error code, as the pendant's log has it
   version A.B.C.D         report this version of PolyScope to later connections
   payload KG              have another payload set at the pendant
-  normal                  end all of them
+  normal                  end all of them, and the program on the robot
 """
 
 

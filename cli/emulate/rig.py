@@ -46,7 +46,7 @@ Commands, one a line on standard input:
   skin FAULT                  any fault of `emulate skin`, for instance skin short 1
   gripper drop|fault CODE|…   the tool falls; or any command of `emulate gripper-socket`
   protective-stop, …          any fault of `emulate ur`
-  normal                      end all faults, the robot's included
+  normal                      end all faults, and the program on the robot: `unlock` starts it again
 With --speed N gel, fingers and boards are N times as fast; the arm stays in real time.
 """
 SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear, and the robot's events.

@@ -144,7 +144,8 @@ class FaultCode(Enum):
     EMERGENCY_STOP = Rule(
         _KEEP,
         "the robot's emergency stop is pressed: {detail}.",
-        "Release the button, power the arm on at the pendant, then send `shearloop command unlock`.",
+        "Make the cell safe and release the button, then send `shearloop command unlock`, which powers the arm and "
+        "releases its brakes.",
         stops_at_rest=True,
     )
     GRIPPER_FAULT = Rule(

@@ -265,9 +265,10 @@ def adapt(
 ) -> tuple[Calibration, GainCorrection]:
     """Return a calibration with the gain of each fingertip corrected by recordings of known torque, and the correction.
 
-    `source` describes them in words, `names` each of them. Twists count from each recording's frame of `first_frames`
-    on. The correction is shrunk by their uncertainty. Raises CalibrationError for recordings without a torque estimate
-    under load, for frames that the calibration has learned from, and for a calibration without such a gain.
+    There is at least one recording. `source` describes them in words, `names` each of them. Twists count from each
+    recording's frame of `first_frames` on. The correction is shrunk by their uncertainty. Raises CalibrationError for
+    recordings without a torque estimate under load, for frames that the calibration has learned from, and for a
+    calibration without such a gain.
     """
     if len(tools := _tools_of(recordings)) > 1:
         raise CalibrationError("the recordings are of several tools; adapt to one at a time")

@@ -143,8 +143,3 @@ def test_frames_before_the_part_to_adapt_on_are_not_its_cause(part, first, said,
     recording = twisting(seed=7, peak_nm=0.08).between(part.start, part.stop)
     with pytest.raises(CalibrationError, match=said):
         adapt(motion_calibration, [recording], "x", first_frames=[first])
-
-
-def test_adapting_on_no_recording_is_refused(motion_calibration):
-    with pytest.raises(CalibrationError, match="the recordings have no frame of the part"):
-        adapt(motion_calibration, [], "x")

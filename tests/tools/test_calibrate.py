@@ -257,10 +257,7 @@ async def halted_mm(host: str, port: int, interrupt: Callable[[], None]) -> tupl
         await gripper.close()
 
 
-@pytest.mark.parametrize(
-    "number",
-    [signal.SIGINT, *(pytest.param(number, marks=pytest.mark.long) for number in (signal.SIGHUP, signal.SIGTERM))],
-)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])
 @pytest.mark.parametrize("program", ["calibrate", "commission"])
 def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number, tmp_path):
     """They would go on by themselves, onto a hand that reaches for what stopped."""

@@ -220,7 +220,6 @@ def _holds_in(file: ExperimentFile, run: Run) -> None:
             last = None
 
 
-@pytest.mark.long
 @given(content=_CLAMPED, seed=st.integers(0, 2**32))
 @settings(max_examples=400, deadline=None)
 def test_what_the_plan_says_of_a_clamped_tool_holds_in_every_run(content, seed):
@@ -229,7 +228,6 @@ def test_what_the_plan_says_of_a_clamped_tool_holds_in_every_run(content, seed):
         _holds_in(file, Run(random.Random(seed + number), clamped=True, reaches=True))
 
 
-@pytest.mark.long
 @given(begins=st.sampled_from([[], [_RELEASE], [_RELEASE, {"do": "turn_to", "angle_rad": 0.1}]]), content=_GRIPPED,
        seed=st.integers(0, 2**32))  # fmt: skip
 @settings(max_examples=400, deadline=None)

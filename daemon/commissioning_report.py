@@ -1,9 +1,9 @@
 """The report of a rig's commissioning: its rig, its stages with their lines, and the values that they supply."""
 
-from collections.abc import Iterator, Mapping
-from typing import Annotated, Final, Literal
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, Final, Literal
 
-from pydantic import AfterValidator, AwareDatetime, Field
+from pydantic import AfterValidator, AwareDatetime, Field, ValidationInfo, field_validator
 
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Record, Supplied
 
@@ -50,6 +50,16 @@ class Line(Record):
     verdict: Verdict = "noted"
 
 
+def has_failed(lines: Iterable[Line]) -> bool:
+    """Return whether a line failed."""
+    return any(line.verdict == "failed" for line in lines)
+
+
+def stage_number(name: str) -> str:
+    """Return the figure at the beginning of a stage's name, by which the stage is known."""
+    return name[0]
+
+
 def _numbered(name: str) -> str:
     if not name[:1].isdecimal():
         raise ValueError("a stage's name begins with its number, as in `7 tool and spring`")
@@ -70,15 +80,21 @@ class StageResult(Record):
     supplies: Supplied = NOTHING_SUPPLIED
     judged_sha256s: Mapping[str, str] = {}
 
+    @field_validator("supplies", mode="before")
+    @classmethod
+    def _of_a_stage_that_passed(cls, value: Any, info: ValidationInfo) -> Any:
+        """Return no values for a failed stage: they may be beyond every range, and an earlier version wrote them."""
+        return NOTHING_SUPPLIED if has_failed(info.data.get("lines", ())) else value
+
     @property
     def number(self) -> str:
-        """The figure at the beginning of the stage's name."""
-        return self.stage[0]
+        """The stage's number."""
+        return stage_number(self.stage)
 
     @property
     def passed(self) -> bool:
         """Whether no line failed."""
-        return all(line.verdict != "failed" for line in self.lines)
+        return not has_failed(self.lines)
 
 
 class Report(Record):
@@ -94,7 +110,7 @@ class Report(Record):
         return bool(self.stages) and all(stage.passed for stage in self.stages)
 
     def stage(self, number: str) -> StageResult | None:
-        """Return the stage with this figure at the beginning of its name, if it was run."""
+        """Return the stage with this number, if it was run."""
         return next((stage for stage in self.stages if stage.number == number), None)
 
     def supplied(self) -> Supplied:

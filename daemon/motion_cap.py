@@ -29,17 +29,21 @@ CAPPED_M_PER_S: Final = 0.05
 CAPPED_NM: Final = 0.3
 # A measured value beyond this multiple of a capped speed stops the motion.
 _HARD: Final = 1.6
-# Without the closing quote, for options. A report is continued in its own file.
-CONTINUE: Final = "run `shearloop commission CONFIG --out FILE"
 # The stages that a quantity's limits depend on, by the first figure of their names.
 _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
 
 
-def new_report(file: str = "NEW_FILE", *, emulated: bool = False) -> str:
-    """Return the cure where no report can be continued; `emulated`: one of emulated devices helps."""
-    options = " --emulate" if emulated else ""
-    made = f"run `shearloop commission CONFIG --out {file}{options}`"
+def new_report(file: str = "NEW_FILE", *, rehearsed: bool = False) -> str:
+    """Return the cure where no report can be continued.
+
+    In a rehearsal one of emulated devices helps. The configuration does not name it, because the real rig would refuse
+    it.
+    """
+    if rehearsed:
+        made = f"run `shearloop commission CONFIG --out {file} --emulate`"
+        return f"{made}, then rehearse with `--set commissioned={file}`"
+    made = f"run `shearloop commission CONFIG --out {file}`"
     return f"{made}, then write `commissioned: {file}` into the configuration"
 
 
@@ -114,10 +118,10 @@ class Commissioning:
         if self.emulated:
             return None
         if self.report is None:
-            cure = new_report("FILE", emulated=self.rehearsed)
+            cure = new_report("FILE", rehearsed=self.rehearsed)
             return MotionCap("`commissioned` is not in the configuration", cure)
         if why := self.reason or self._other:
-            return MotionCap(*why)
+            return MotionCap(why.cause, why.cure)
         found = self.report.supplied()
         wrist_rad_per_s = found.wrist_speed_rad_per_s if self.report.has(_SPEED_NEEDS) else None
         torque_nm = (found.torque_nm if self.report.has(_TORQUE_NEEDS) else None) or 0.0

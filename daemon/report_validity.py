@@ -10,11 +10,11 @@ from typing import Final
 
 from shearloop.daemon.commissioning_report import Report, StageResult
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.motion_cap import CONTINUE, new_report
+from shearloop.daemon.motion_cap import new_report
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, text_sha256s
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
 from shearloop.errors import Hint, UserError
-from shearloop.yaml_files import load_model
+from shearloop.yaml_files import Document
 
 # A report counts for this time after its oldest stage.
 MAX_AGE_DAYS: Final = 180
@@ -27,7 +27,7 @@ def old_stages(report: Report, config: DaemonConfig) -> list[tuple[StageResult, 
     hashes, texts = judged_sha256s(config), text_sha256s(config)
     found = []
     for stage in report.stages:
-        own, now = stage.judged_sha256s, judged_by(stage.stage, hashes)
+        own, now = stage.judged_sha256s, judged_by(stage.number, hashes)
         changed = [key for key in sorted({*own, *now}) if own.get(key) not in _hashes_of(key, now, texts)]
         if changed:
             found.append((stage, [f"`{key}`" for key in changed]))
@@ -55,33 +55,44 @@ def why_not(report: Report, config: DaemonConfig, now: datetime) -> Hint | None:
     seen = seen.model_copy(update=robot)
     if differs := list(report.rig.differences(seen)):
         changed = f"{' and '.join(differs)} changed since {name} was measured"
-        return Hint(changed, new_report(emulated=rehearsed))
+        return Hint(changed, new_report(rehearsed=rehearsed))
     # A report of real devices is continued on these, also if a rehearsal uses it.
-    again = CONTINUE + " --emulate" * is_emulated
+    options = ("--emulate",) if is_emulated else ()
     if old := old_stages(report, config):
         keys = " and ".join(dict.fromkeys(key for _, differs in old for key in differs))
         cause = f"{keys} changed since stage {' and '.join(one.stage for one, _ in old)} of {name}"
-        return Hint(cause, _measure_again(again, [stage for stage, _ in old]))
+        return Hint(cause, _measured_again([stage for stage, _ in old], *options))
     failed = [f"{line.what} in stage {stage.stage}" for stage in report.stages for line in stage.lines
               if line.verdict == "failed"]  # fmt: skip
     if failed:
-        return Hint(f"{name} says that {failed[0]} failed", f"mend the cause, and {again}`")
+        return Hint(f"{name} says that {failed[0]} failed", f"mend the cause, and {_continued(*options)}")
     if not report.stages:
-        return Hint(f"{name} has no stage", f"{again}`")
+        return Hint(f"{name} has no stage", _continued(*options))
     if expired := [stage for stage in report.stages if now - stage.date > timedelta(days=MAX_AGE_DAYS)]:
         date = min(stage.date for stage in expired)
-        return Hint(f"{name} is of {date:%Y-%m-%d}, older than {MAX_AGE_DAYS} days", _measure_again(again, expired))
+        return Hint(f"{name} is of {date:%Y-%m-%d}, older than {MAX_AGE_DAYS} days", _measured_again(expired, *options))
     if early := [stage for stage in report.stages if stage.date - now > _CLOCKS_DIFFER]:
         date = max(stage.date for stage in early)
         cause = f"{name} is of {date:%Y-%m-%d}, which is in the future by this computer's clock"
-        return Hint(cause, f"set the clock, or {_measure_again(again, early)}")
+        return Hint(cause, f"set the clock, or {_measured_again(early, *options)}")
     return None
 
 
-def _measure_again(again: str, stages: Sequence[StageResult]) -> str:
-    return f"{again} --stages {''.join(stage.number for stage in stages)}`"
+def _continued(*options: str) -> str:
+    """Return the cure that continues a report in its own file."""
+    command = " ".join(("shearloop commission CONFIG --out FILE", *options))
+    return f"run `{command}`"
+
+
+def _measured_again(stages: Sequence[StageResult], *options: str) -> str:
+    return _continued(*options, "--stages", "".join(stage.number for stage in stages))
 
 
 def load_report(path: Path) -> Report:
     """Return the report in a file; raises UserError for a file that is not a report."""
-    return load_model(path, Report, UserError, "report of a commissioning", "; make it with `shearloop commission`")
+    cure = "; make it with `shearloop commission`"
+    document = Document.read(path, UserError, "report of a commissioning", cure, model=Report)
+    try:
+        return document.model(Report)
+    except UserError as error:
+        raise UserError(f"{error}\nThis report cannot be continued: {new_report()}") from error

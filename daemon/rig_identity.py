@@ -124,9 +124,9 @@ def _values_of(path: Path | None, model: type[CalibrationModel]) -> dict[str, An
         raise UserError(str(error)) from error
 
 
-def judged_by(stage: str, hashes: Mapping[str, str]) -> dict[str, str]:
-    """Return the hashes of the keys and files that a stage judges."""
-    return {name: own for name, own in hashes.items() if stage[0] in _JUDGED_BY[name]}
+def judged_by(number: str, hashes: Mapping[str, str]) -> dict[str, str]:
+    """Return the hashes of the keys and files that the stage with this number judges."""
+    return {name: own for name, own in hashes.items() if number in _JUDGED_BY[name]}
 
 
 def source_sha256(config: DaemonConfig, source: str) -> str | None:

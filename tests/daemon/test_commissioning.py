@@ -25,7 +25,7 @@ from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
-from shearloop.tools.commission.report import save_report
+from shearloop.tools.commission.report import earlier_report, save_report
 from shearloop.tools.doctor import check_cap
 from shearloop.tools.doctor.devices import check_identity
 from tests.fixtures.daemons import ask, collector, robot_at, running_daemon
@@ -174,6 +174,32 @@ def test_a_report_with_a_value_that_no_stage_measures_is_refused(tmp_path, key, 
         load_report(path)
 
 
+def test_a_value_beyond_its_range_names_the_way_to_a_report_without_it(tmp_path):
+    """It invites nobody to edit a measurement."""
+    path = tmp_path / "report.yaml"
+    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    written = yaml.safe_load(path.read_text())
+    written["stages"][0]["supplies"]["rest_rad_per_s"] = 0.08
+    path.write_text(yaml.safe_dump(written))
+    with pytest.raises(UserError) as refused:
+        load_report(path)
+    assert str(refused.value).endswith(f"This report cannot be continued: {NEW}")
+
+
+def test_the_values_of_a_failed_stage_are_left_out_whatever_they_are(tmp_path, capsys):
+    """An earlier version wrote the noise that failed the stage, and the range of rest ends before it."""
+    save_report(tmp_path / "report.yaml", report_of(write_rig(tmp_path), "0134", SUPPLIED))
+    written = yaml.safe_load((tmp_path / "report.yaml").read_text())
+    failed = written["stages"][2]
+    failed["lines"][0]["verdict"], failed["supplies"] = "failed", {"rest_rad_per_s": 0.08}
+    (tmp_path / "report.yaml").write_text(yaml.safe_dump(written))
+    report = earlier_report(tmp_path / "report.yaml")
+    assert report.stage("3").supplies == NOTHING_SUPPLIED
+    assert report.stage("4").supplies == SUPPLIED, "another stage keeps its values"
+    assert main(["check", str(write_rig(tmp_path, commissioned="report.yaml"))]) == 0
+    assert "says that w in stage 3 s failed; mend the cause, and run" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("name", ["", "tool and spring"])
 def test_a_stage_without_a_number_is_refused(tmp_path, name):
     path = tmp_path / "report.yaml"
@@ -255,7 +281,9 @@ def test_a_rehearsal_has_the_cap_of_the_rig_that_it_plays(tmp_path):
     found = rehearsing(tmp_path, None)
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
     assert found.settings.limits.wrist_speed_rad_per_s.inner == CAPPED_RAD_PER_S
-    assert "--emulate`, then write `commissioned: FILE`" in found.sentence
+    assert found.cap.cure == (
+        "run `shearloop commission CONFIG --out FILE --emulate`, then rehearse with `--set commissioned=FILE`"
+    )
 
 
 @pytest.mark.parametrize("emulated", [True, False])
@@ -284,6 +312,7 @@ def test_an_emulated_rig_takes_no_controller_but_an_emulated_one(tmp_path, rehea
 def test_a_rehearsal_of_another_rig_is_not_raised(tmp_path):
     report = changed(report_of(write_rig(tmp_path), "013457", SUPPLIED), emulated=True)
     found = rehearsing(tmp_path, report, wrist=0.7)
+    assert found.cap.cure.endswith("--out NEW_FILE --emulate`, then rehearse with `--set commissioned=NEW_FILE`")
     assert "the robot's settings changed" in found.cap.why
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from shearloop.daemon.commissioning_report import Line
+from shearloop.daemon.commissioning_report import Line, has_failed
 from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.ur.limits import ACCELERATION_S
 from shearloop.drivers.ur.settings import MIN_REST_RAD_PER_S
@@ -15,7 +15,7 @@ from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.observer import WRIST, Seen
 from shearloop.tools.commission.operator import Played
-from shearloop.tools.commission.report import Measured, has_failed, judged, percentile_99
+from shearloop.tools.commission.report import Measured, judged, percentile_99
 
 STAGE: Final = "3 empty gripper"
 SPEED_RAD_PER_S: Final = 0.2

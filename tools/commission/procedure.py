@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
-from shearloop.daemon.commissioning_report import Report, StageResult
+from shearloop.daemon.commissioning_report import Report, StageResult, stage_number
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.motion_cap import why_not_emulated
 from shearloop.daemon.report_validity import old_stages
@@ -15,7 +15,6 @@ from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
 from shearloop.daemon.sensing.skin_task import check_circuit
 from shearloop.daemon.sensors import load_cell_calibration
-from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
 from shearloop.errors import UserError
 from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.commission import boards, gripper, identity, motion, rtde, stops, tool, wrench
@@ -26,7 +25,6 @@ from shearloop.tools.commission.remembered import LeftRobot
 from shearloop.tools.commission.report import (
     Measured,
     earlier_report,
-    has_failed,
     page_path,
     report_for,
     save_report,
@@ -66,7 +64,7 @@ def commission(
     the configuration. The report is written after each stage. Raises UserError if a stage cannot be measured,
     DriverError for a missing device.
     """
-    if unknown := [figure for figure in only if figure not in {stage[0] for stage in STAGES}]:
+    if unknown := [figure for figure in only if figure not in map(stage_number, STAGES)]:
         raise UserError(f"--stages: there is no stage {', '.join(unknown)}; there are {', '.join(STAGES)}")
     settings = open_settings(config)
     if settings is None:
@@ -128,13 +126,13 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
         operator.say(f"The report says EMULATED{times}.")
     name = operator.word_of("Your name:")
     for stage, measure in STAGES.items():
-        done = context.report.stage(stage[0])
-        if (done is not None and done.passed and stage[0] not in only) or (only and stage[0] not in only):
+        number = stage_number(stage)
+        done = context.report.stage(number)
+        is_due = number in only if only else done is None or not done.passed
+        if not is_due:
             continue
-        if failed := [
-            earlier.stage for earlier in context.report.stages if not earlier.passed and earlier.stage < stage
-        ]:
-            raise UserError(f"stage {failed[0]} failed: mend it and run it again before stage {stage}")
+        if failed := [one for one in context.report.stages if not one.passed and one.number < number]:
+            raise UserError(f"stage {failed[0].stage} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
         if stage != identity.STAGE:
             # A daemon of another computer may have begun since the last stage.
@@ -146,8 +144,8 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
             operator=name,
             date=datetime.now(UTC),
             lines=tuple(measured.lines),
-            supplies=NOTHING_SUPPLIED if has_failed(measured.lines) else measured.supplies,
-            judged_sha256s=judged_by(stage, judged_sha256s(context.config)),
+            supplies=measured.supplies,
+            judged_sha256s=judged_by(number, judged_sha256s(context.config)),
         )
         context.report = with_stage(context.report, result)
         save_report(out, context.report, not_measured(context.report))
@@ -163,4 +161,4 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
 
 def not_measured(report: Report) -> list[str]:
     """Return the stages that a report lacks."""
-    return [stage for stage in STAGES if report.stage(stage[0]) is None]
+    return [stage for stage in STAGES if report.stage(stage_number(stage)) is None]

@@ -32,11 +32,6 @@ def judged(what: str, value: str, limit: str, promise: str, *, passed: bool, cou
     return Line(what=what, value=value, limit=limit, count=count, promise=promise, verdict=verdict)
 
 
-def has_failed(lines: Iterable[Line]) -> bool:
-    """Return whether a line failed."""
-    return any(line.verdict == "failed" for line in lines)
-
-
 def percentile_99(values: Iterable[float]) -> float:
     """Return the smallest value that 99 of 100 do not exceed."""
     ordered = sorted(values)
@@ -115,13 +110,14 @@ def report_for(rig: RigIdentity, found: Report | None, path: Path) -> Report:
 def with_stage(report: Report, result: StageResult) -> Report:
     """Return a report with this result, which replaces an earlier result of the same stage, also by another name."""
     others = [stage for stage in report.stages if stage.number != result.number]
-    stages = sorted([*others, result], key=lambda stage: stage.stage)
+    stages = sorted([*others, result], key=lambda stage: stage.number)
     return report.model_copy(update={"stages": tuple(stages)})
 
 
 def without_stage(report: Report, result: StageResult) -> Report:
     """Return a report without this stage."""
-    return report.model_copy(update={"stages": tuple(stage for stage in report.stages if stage != result)})
+    others = (stage for stage in report.stages if stage.number != result.number)
+    return report.model_copy(update={"stages": tuple(others)})
 
 
 def page_path(report: Path) -> Path:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from shearloop.daemon.commissioning_report import Line
+from shearloop.daemon.commissioning_report import Line, has_failed
 from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.ur.client import WORKER
 from shearloop.drivers.ur.messages import SAFETY_NORMAL, SAFETY_REDUCED
@@ -19,7 +19,7 @@ from shearloop.tools.commission.limits import MODE_AFTER_S, REHEARSED, RESTS_WIT
 from shearloop.tools.commission.mover import WATCHDOG_WORKER
 from shearloop.tools.commission.mover_process import CAUSES, WORKERS
 from shearloop.tools.commission.observer import Seen
-from shearloop.tools.commission.report import Measured, has_failed, judged
+from shearloop.tools.commission.report import Measured, judged
 
 STAGE: Final = "4 stops"
 # A turn begins this far from the pose, on the other side.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Final, Self
 
-from shearloop.daemon.commissioning_report import Line
+from shearloop.daemon.commissioning_report import Line, has_failed
 from shearloop.daemon.motion_cap import CAPPED_NM
 from shearloop.daemon.rig import gels_of
 from shearloop.daemon.rig_identity import source_sha256
@@ -26,7 +26,7 @@ from shearloop.tools.commission.fingers import FINGERS_MM_PER_S, GRIP_N, close_f
 from shearloop.tools.commission.listening import SILENT_S
 from shearloop.tools.commission.motion import TURN_RAD
 from shearloop.tools.commission.operator import Played
-from shearloop.tools.commission.report import Measured, has_failed, judged
+from shearloop.tools.commission.report import Measured, judged
 from shearloop.tools.commission.tactile import TactileSensor, calibrated_sessions
 from shearloop.tools.commission.wrench import read
 

@@ -28,16 +28,9 @@ from shearloop.drivers.ur.messages import (
 from shearloop.drivers.ur.ports import lose_dead_peers_of_ports
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.receiver import RtdeReceiver
-from shearloop.drivers.ur.rtde import are_in_use
+from shearloop.drivers.ur.rtde import has_other_client
 from shearloop.drivers.ur.sample_age import SampleAge
-from shearloop.drivers.ur.script import (
-    LOWER,
-    NO_MOTION_TICKS,
-    UPPER,
-    ScriptRegisters,
-    control_program,
-    why_other_client,
-)
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, ScriptRegisters, control_program, why_other_client
 from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.script_readiness import ScriptReadiness
 from shearloop.drivers.ur.settings import Six, UrSettings
@@ -289,8 +282,7 @@ class UrArm:
 
     def has_other_client(self) -> bool:
         """Return whether another client writes registers that a control program reads, as another daemon does."""
-        others = LOWER if self._registers == UPPER else UPPER
-        return are_in_use(self._settings.host, self._settings.connect_timeout_s / 8, others)
+        return has_other_client(self._settings.host, self._settings.connect_timeout_s / 8, self._registers)
 
     def ask_dashboard(self, *requests: str) -> str:
         """Have the dashboard carry out requests; return and raise as `command_dashboard` does."""

@@ -67,6 +67,11 @@ def are_in_use(host: str, timeout_s: float, registers: ScriptRegisters) -> bool:
         return b"IN_USE" in request(connection, INPUTS, ",".join(registers.inputs).encode())
 
 
+def has_other_client(host: str, timeout_s: float, own: ScriptRegisters) -> bool:
+    """Return whether another client writes the half of the registers that is not `own`, as another daemon does."""
+    return are_in_use(host, timeout_s, LOWER if own == UPPER else UPPER)
+
+
 def registers_in_use(host: str) -> RobotLostError:
     """Return the error about input registers that another client writes."""
     return RobotLostError(

@@ -31,7 +31,11 @@ _CLOCK_S: Final = 0.25
 _CLOCK_SAMPLES: Final = 5
 _REPLACED: Final = (
     "Another program plays on the robot: a daemon of another user or computer, or the pendant, has replaced the "
-    "commissioning's. It may hold a tool. The commissioning replaces it."
+    "commissioning's. It may hold a tool."
+)
+_NOT_ENDED: Final = (
+    "The commissioning does not end that program, because a stop may wait there: end the other daemon, or stop the "
+    "program at the teach pendant, then run it again"
 )
 # A joint that has moved by more between a question and its answer makes another pose.
 _SAME_POSE_RAD: Final = 0.01
@@ -106,7 +110,9 @@ class Context:
         if self._mover is not None:
             # The observer reads the robot's state all the time. Only our program changes this clock.
             if self._another_plays():
-                self.operator.accept(_REPLACED)
+                if self.rig.has_other_client(self.registers):
+                    raise UserError(f"{_REPLACED} Another client writes the robot's registers too. {_NOT_ENDED}")
+                self.operator.accept(f"{_REPLACED} The commissioning replaces it.")
             return
         seen = self.rig.controller()
         if seen.registers is None:
@@ -117,11 +123,9 @@ class Context:
             self.clock.sleep(ENDS_ITSELF_S)
             outputs = self.rig.outputs(self.registers)
         signs = other_programs(seen, outputs)
-        if {sign.kind for sign in signs} == {*SignKind}:
-            raise UserError(
-                f"{' '.join(sign.sentence for sign in signs)} The commissioning does not end that program, because a "
-                "stop may wait there: end the other daemon, or stop the program at the teach pendant, then run it again"
-            )
+        kinds = {sign.kind for sign in signs}
+        if SignKind.REGISTERS in kinds and SignKind.PROGRAM in kinds:
+            raise UserError(f"{' '.join(sign.sentence for sign in signs)} {_NOT_ENDED}")
         for sign in signs:
             if sign not in self._accepted:
                 moves = "The commissioning replaces such a program, and moves robot and gripper."

@@ -18,7 +18,7 @@ from shearloop.drivers.shear_skin.skin import SkinSample
 from shearloop.drivers.ur.control_box import ControllerInfo, query_controller
 from shearloop.drivers.ur.dashboard import ask_dashboard
 from shearloop.drivers.ur.messages import RtdeOutputs
-from shearloop.drivers.ur.rtde import register_round_trip
+from shearloop.drivers.ur.rtde import has_other_client, register_round_trip
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.estimation.skin.calibration import load_calibration
@@ -45,6 +45,9 @@ class Rig(Protocol):
 
     def arm(self) -> Arm:
         """Return the arm's model and its rated payload."""
+
+    def has_other_client(self, own: ScriptRegisters) -> bool:
+        """Return whether another client writes the registers beside ours."""
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""
@@ -92,6 +95,10 @@ class ConnectedRig:
         """Return the arm's model and its rated payload."""
         settings = self._settings
         return read_arm(settings.host, settings.connect_timeout_s, settings.facts.major)
+
+    def has_other_client(self, own: ScriptRegisters) -> bool:
+        """Return whether another client writes the registers beside ours."""
+        return has_other_client(self._settings.host, self._settings.connect_timeout_s, own)
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""

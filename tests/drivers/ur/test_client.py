@@ -18,6 +18,7 @@ from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.control_box import probe_controller, query_controller
 from shearloop.drivers.ur.messages import Enable, MoveLinear, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.rtde import has_other_client
 from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.drivers.ur.settings import InstalledTool
 from tests.drivers.ur.robots import ROOT, enable, pid_of, running, settings_for, until
@@ -273,8 +274,11 @@ async def test_connection_that_is_refused_is_explained(controller, link, fault, 
 async def test_registers_of_the_upper_half_that_another_client_writes_are_left_to_it(controller):
     host = controller.host
     assert query_controller(host, 5.0).registers == UPPER
+    assert not has_other_client(host, 5.0, LOWER)
     await controller.fault("upper-registers-in-use")
     assert query_controller(host, 5.0).registers == LOWER
+    assert has_other_client(host, 5.0, LOWER)
+    assert not has_other_client(host, 5.0, UPPER)
     async with running(settings_for(host)) as robot:
         await enable(robot)
         await turn(robot, controller, 0.1)

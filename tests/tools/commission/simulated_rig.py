@@ -342,6 +342,8 @@ class SimulatedRig:
         self.serial_number = EMULATED_SERIAL_NUMBER if config.emulated else "1"
         self.clock = SimulatedClock(self)
         # Until then nothing comes from the robot. The observer gets what is held back later.
+        # Whether another client writes the registers beside ours.
+        self.other_client = False
         self._silent_until_s, self._holds_back = -math.inf, False
         self._held: list[tuple[int, RtdeOutputs]] = []
         self._mover: SimulatedMover | None = None
@@ -448,6 +450,9 @@ class SimulatedRig:
 
     def write_register(self, _registers: ScriptRegisters, value: int) -> int:
         return value
+
+    def has_other_client(self, _own: ScriptRegisters) -> bool:
+        return self.other_client
 
     def stop_program(self) -> None:
         self.robot.end_program("stopped from the dashboard")

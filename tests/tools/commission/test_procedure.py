@@ -17,6 +17,7 @@ from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.report_validity import load_report
 from shearloop.daemon.rig import open_settings
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
+from shearloop.errors import UserError
 from shearloop.tools.commission import stops
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts
@@ -382,6 +383,11 @@ def test_a_program_that_replaced_the_commissionings_is_asked_about_before_the_ne
         lab.operator.declined = "Another program plays"
         with pytest.raises(DeclinedError):
             context.expect_no_other_program()
+        lab.operator.asked.clear()
+        lab.rig.other_client = True
+        with pytest.raises(UserError, match="end the other daemon, or stop the program at the teach pendant"):
+            context.expect_no_other_program()
+        assert lab.operator.asked == [], "the program may be another daemon's, and the worker refuses to end it"
 
 
 def test_an_emergency_stop_of_a_wrist_that_stands_is_none(lab):

@@ -1,6 +1,5 @@
 """The torques of calibrated fingertips, while the stages move the robot."""
 
-import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
@@ -17,7 +16,7 @@ from shearloop.estimation.values import Estimate, TactileFrame
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.listening import SILENT_S
 
-# Estimates that are averaged.
+# A mean of that many torques is compared.
 ESTIMATES: Final = 3
 # Frames without an estimate: after a grip an estimator needs some frames of it.
 _MAX_FRAMES: Final = 60
@@ -77,16 +76,22 @@ class TactileSensor:
                 return
         raise UserError(f"the idle frame of {self.name} could not be taken: {reason}")
 
-    def torque_nm(self) -> float | None:
-        """Return the mean of the next torques, or None without torques."""
+    def on_grip(self) -> None:
+        """Begin with a gel at rest after the frames of a grip, as the control loop does."""
+        self._next()
+        if self._creep is not None:
+            self._creep.reset()
+
+    def torques_nm(self) -> list[float]:
+        """Return the next torques, at least `ESTIMATES`, or none."""
         # The first frame may have begun before now.
         self._next()
         torques_nm: list[float] = []
         for _ in range(_MAX_FRAMES):
             torques_nm += [estimate.torque_nm for estimate in self._next() if estimate.torque_nm is not None]
             if len(torques_nm) >= ESTIMATES:
-                return statistics.fmean(torques_nm)
-        return None
+                return torques_nm
+        return []
 
 
 def calibrated_sessions(config: DaemonConfig) -> dict[str, tuple[Session, Sequence[str]]]:

@@ -5,8 +5,7 @@ import statistics
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from enum import Enum
-from typing import Final, Self
+from typing import Final
 
 from shearloop.daemon.commissioning_report import Line, has_failed
 from shearloop.daemon.motion_cap import CAPPED_NM
@@ -42,6 +41,10 @@ REPEATS_MM: Final = 1.0
 SCALE_TOLERANCE: Final = 0.2
 # A lever presses one way only if the other torques are below this fraction.
 _ONE_WAY: Final = 0.3
+# A turn shows on a device as more than this fraction of the spring's torque, and of the angle, and beyond the noise.
+_SHOWN_TORQUE: Final = 0.05
+_SHOWN_ANGLE: Final = 0.5
+_NOISE_ERRORS: Final = 4.0
 # The twists at which the fingertips are read too.
 _FELT: Final = 2
 _SLOWLY_RAD_PER_S: Final = 0.1
@@ -49,35 +52,19 @@ _HELD_S: Final = 1.0
 _SETTLES_S: Final = 0.5
 
 
-class ChangeSign(Enum):
-    """The sign of a change."""
-
-    POSITIVE = 1
-    NEGATIVE = -1
-    NONE = 0
-
-    @classmethod
-    def of(cls, change: float) -> Self:
-        """Return the sign of a change; a device that shows none has no sign."""
-        return cls((change > 0) - (change < 0))
-
-    @property
-    def words(self) -> str:
-        """The sign in words."""
-        return "no change" if self is ChangeSign.NONE else self.name.lower()
-
-
 @dataclass(frozen=True, slots=True)
 class Held:
     """The wrist's angle, the load cell's torque, and the torque of the robot's wrench about the tool's axis.
 
-    `tactile_nm` are the torques of the calibrated fingertips, by their names; None without an estimate.
+    `tactile_nm` are the torques of the calibrated fingertips, by their names; None without an estimate. `errors_nm` are
+    the standard errors of all these means by their sources.
     """
 
     wrist_rad: float
     load_nm: float
     wrench_nm: float
     tactile_nm: Mapping[str, float | None] = field(default_factory=dict)
+    errors_nm: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +75,10 @@ class Sensors:
     rate_hz: float
     tactile: Sequence[TactileSensor]
 
-    def load_nm(self) -> float:
-        """Return the mean torque of the next `_HELD_S`."""
+    def load_nm(self) -> list[float]:
+        """Return the load cell's torques of the next `_HELD_S`."""
         samples = self.load.take(max(3, round(_HELD_S * self.rate_hz)), SILENT_S)
-        return statistics.fmean(sample.torque_nm for sample in samples)
+        return [sample.torque_nm for sample in samples]
 
 
 def measure(context: Context) -> Measured:
@@ -110,10 +97,10 @@ def measure(context: Context) -> Measured:
     way = cell.only_sign
     with ExitStack() as opened:
         tactile = _tactile(context, opened)
-        lines = _grips(context, tactile) if context.config.gripper is not None else []
+        lines = repeated_grips(context, tactile) if context.config.gripper is not None else []
         sensors = Sensors(opened.enter_context(context.rig.load_cell()), cell.rate_hz, tactile)
         context.ready()
-        turned = _signs(context, sensors, way)
+        turned = _signs(context, sensors, spring, way)
         held, delays_s = _twists(context, sensors)
     scales, right = judge_scales(held, context.settings.facts.estimated_nm, way)
     lines += [*turned, *judge_twists(held, spring, way), *scales]
@@ -168,7 +155,7 @@ def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
     return found
 
 
-def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
+def repeated_grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
     """Tare the fingertips, grip the tool several times, and leave it gripped."""
     count = context.counts.starts
     context.operator.allow(
@@ -187,6 +174,8 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
             if closed.diameter_mm is None:
                 raise UserError("the gripper holds nothing: put the tool between its fingers, and run the stage again")
             diameters_mm.append(closed.diameter_mm)
+        for sensor in tactile:
+            sensor.on_grip()
     spread_mm = max(diameters_mm) - min(diameters_mm)
     return [
         judged(
@@ -202,19 +191,28 @@ def _grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
 
 def _hold(context: Context, sensors: Sensors) -> Held:
     """Return the measurements while the wrist stands, without the fingertips."""
-    load_nm = sensors.load_nm()
+    loads_nm = sensors.load_nm()
     outputs = context.observer.latest().outputs
     reading = read(context)
     # The loop's sign of a torque: the torque of the wrist on the tool.
     axis = tool_axis(outputs.tcp_pose)
     wrench_nm = -sum(one * other for one, other in zip(axis, reading.mean[3:], strict=True))
-    return Held(context.observer.latest().wrist_rad, load_nm, wrench_nm)
+    errors_nm = {LOAD_CELL: standard_error(loads_nm), WRENCH: reading.torque_error_nm}
+    return Held(context.observer.latest().wrist_rad, statistics.fmean(loads_nm), wrench_nm, errors_nm=errors_nm)
 
 
 def _hold_and_feel(context: Context, sensors: Sensors) -> Held:
     """Return the measurements while the wrist stands."""
     held = _hold(context, sensors)
-    return replace(held, tactile_nm={sensor.name: sensor.torque_nm() for sensor in sensors.tactile})
+    felt = {sensor.name: sensor.torques_nm() for sensor in sensors.tactile}
+    means_nm = {name: statistics.fmean(torques_nm) if torques_nm else None for name, torques_nm in felt.items()}
+    errors_nm = {name: standard_error(torques_nm) for name, torques_nm in felt.items() if torques_nm}
+    return replace(held, tactile_nm=means_nm, errors_nm={**held.errors_nm, **errors_nm})
+
+
+def standard_error(values: Sequence[float]) -> float:
+    """Return the standard error of the mean of some independent values."""
+    return statistics.stdev(values) / math.sqrt(len(values))
 
 
 def _turn(context: Context, by_rad: float) -> None:
@@ -222,7 +220,7 @@ def _turn(context: Context, by_rad: float) -> None:
     context.turn_to(context.pose_rad + by_rad, _SLOWLY_RAD_PER_S)
 
 
-def _signs(context: Context, sensors: Sensors, way: int) -> list[Line]:
+def _signs(context: Context, sensors: Sensors, spring: float, way: int) -> list[Line]:
     """Turn once, the way that the load cell measures; the operator says which way the tool turned."""
     context.confirm()
     turn_rad = (way or 1) * TURN_RAD
@@ -240,38 +238,54 @@ def _signs(context: Context, sensors: Sensors, way: int) -> list[Line]:
     )
     _turn(context, 0.0)
     noise_nm = context.settings.facts.estimated_nm
-    return judge_signs(before, after, said, noise_nm, way or 1, emulated=context.config.emulated)
+    return judge_signs(before, after, said, spring, noise_nm, way or 1, emulated=context.config.emulated)
 
 
 def judge_signs(
-    before: Held, after: Held, said: str, wrench_noise_nm: float = 0.0, way: int = 1, *, emulated: bool = False
+    before: Held,
+    after: Held,
+    said: str,
+    spring: float,
+    wrench_noise_nm: float = 0.0,
+    way: int = 1,
+    *,
+    emulated: bool = False,
 ) -> list[Line]:
     """Return the lines on a turn: command, wrist, load cell, wrench and estimates have its sign, `way`.
 
-    A wrench that is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on
-    recordings of real fingertips may refuse `emulated` frames.
+    A device that shows less than its noise, or than a small fraction of the spring's torque, has no sign. A wrench that
+    is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on recordings of real
+    fingertips may refuse `emulated` frames.
     """
-    wanted = ChangeSign(way)
+    wanted = direction_of(way)
 
-    def compared(what: str, change: float) -> Line:
-        found = ChangeSign.of(change)
-        return _sign_line(what, found.words, wanted, passed=found is wanted)
+    def compared(what: str, change: float, least: float, unit: str) -> Line:
+        found = direction_of(change) if abs(change) > least else None
+        return _sign_line(what, found or f"no change beyond {least:.2g} {unit}", wanted, passed=found == wanted)
 
-    is_right = said == direction_of(way)
+    def noise_nm(source: str) -> float:
+        return _NOISE_ERRORS * math.hypot(before.errors_nm.get(source, 0.0), after.errors_nm.get(source, 0.0))
+
+    def torques_compared(what: str, source: str, change_nm: float) -> Line:
+        return compared(what, change_nm, max(_SHOWN_TORQUE * spring * TURN_RAD, noise_nm(source)), "N·m")
+
+    is_right = said == wanted
+    load_nm = after.load_nm - before.load_nm
     lines = [
-        _sign_line("command", wanted.words if is_right else f"the operator said {said!r}", wanted, passed=is_right),
-        compared("wrist", after.wrist_rad - before.wrist_rad),
-        compared("load cell", after.load_nm - before.load_nm),
+        _sign_line("command", said if is_right else f"the operator said {said!r}", wanted, passed=is_right),
+        compared("wrist", after.wrist_rad - before.wrist_rad, _SHOWN_ANGLE * TURN_RAD, "rad"),
+        torques_compared("load cell", LOAD_CELL, load_nm),
     ]
-    if abs(after.load_nm - before.load_nm) >= wrench_noise_nm:
-        lines.append(compared("wrench", after.wrench_nm - before.wrench_nm))
+    known_to_nm = max(wrench_noise_nm, noise_nm(WRENCH))
+    if abs(load_nm) >= known_to_nm:
+        lines.append(torques_compared("wrench", WRENCH, after.wrench_nm - before.wrench_nm))
     else:
-        noise = f"not measured: the robot estimates its wrench to {wrench_noise_nm:g} N·m, and the twist is smaller"
+        noise = f"not measured: the robot's wrench is known to {known_to_nm:.2g} N·m, and the twist is smaller"
         lines.append(Line(what="sign of the wrench", value=noise))
     for name, after_nm in after.tactile_nm.items():
         before_nm, what = before.tactile_nm[name], f"estimate of {name}"
         if after_nm is not None and before_nm is not None:
-            lines.append(compared(what, after_nm - before_nm))
+            lines.append(torques_compared(what, name, after_nm - before_nm))
         elif emulated:
             lines.append(Line(what=f"sign of the {what}", value="not measured: no estimate in the grip"))
         else:
@@ -282,9 +296,9 @@ def judge_signs(
     return lines
 
 
-def _sign_line(what: str, value: str, wanted: ChangeSign, *, passed: bool) -> Line:
+def _sign_line(what: str, value: str, wanted: Direction | None, *, passed: bool) -> Line:
     """Return the line on one sign."""
-    limit = f"{wanted.words}, {direction_of(wanted.value)} for an eye that faces the gripper"
+    limit = f"{wanted} for an eye that faces the gripper"
     return judged(f"sign of the {what}", value, limit, "the loop turns the right way", passed=passed)
 
 

@@ -29,11 +29,13 @@ _READ_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The mean wrench of an arm that stands, and the standard deviations of its force and torque."""
+    """The mean wrench of an arm that stands, the standard deviations of its force and torque, and the mean's error."""
 
     mean: Six
     force_sigma_n: float
     torque_sigma_nm: float
+    torque_error_nm: float = 0.0
+    """The standard error of the mean torque."""
 
     @classmethod
     def of(cls, samples: Sequence[Seen]) -> "Reading":
@@ -41,7 +43,8 @@ class Reading:
         columns = list(zip(*(seen.outputs.wrench for seen in samples), strict=True))
         x, y, z, a, b, c = (statistics.fmean(column) for column in columns)
         sigmas = [statistics.pstdev(column) for column in columns]
-        return cls((x, y, z, a, b, c), math.hypot(*sigmas[:3]), math.hypot(*sigmas[3:]))
+        sigma_nm = math.hypot(*sigmas[3:])
+        return cls((x, y, z, a, b, c), math.hypot(*sigmas[:3]), sigma_nm, sigma_nm / math.sqrt(len(samples)))
 
     @property
     def force_n(self) -> float:

@@ -336,31 +336,52 @@ def test_the_load_cell_fails_its_line(rest, loaded, lines):
     ],
 )
 def test_each_flipped_sign_fails_its_line(after, said, lines):
-    assert failed(judge_signs(Held(0.0, 0.0, 0.0, dict.fromkeys(after.tactile_nm, 0.0)), after, said)) == lines
+    assert failed(judge_signs(Held(0.0, 0.0, 0.0, dict.fromkeys(after.tactile_nm, 0.0)), after, said, 0.8)) == lines
 
 
 @pytest.mark.parametrize("way", [1, -1])
 def test_a_device_that_shows_no_change_has_no_sign(way):
     said = "counterclockwise" if way == 1 else "clockwise"
     before, dead = Held(0.0, 0.0, 0.0), Held(0.08 * way, 0.0, 0.05 * way)
-    assert failed(judge_signs(before, dead, said, way=way)) == ["sign of the load cell"]
+    assert failed(judge_signs(before, dead, said, 0.8, way=way)) == ["sign of the load cell"]
+
+
+def test_a_change_within_the_noise_or_far_below_the_springs_torque_has_no_sign():
+    """Such a device is dead: its readings show less than the twist, by chance in the right direction."""
+    before = Held(0.0, 0.0, 0.0, {"right": 0.0, "left": 0.0})
+    dead = Held(0.08, 1e-6, 0.05, {"right": 1e-5, "left": 0.05})
+    signs = ["sign of the load cell", "sign of the estimate of right"]
+    assert failed(judge_signs(before, dead, "counterclockwise", 0.8)) == signs
+    assert failed(judge_signs(before, Held(1e-4, 0.05, 0.05), "counterclockwise", 0.8)) == ["sign of the wrist"]
+    after = Held(0.08, 0.05, 0.05, {"right": 0.04, "left": 0.04}, {"right": 0.008, "left": 0.006})
+    noisy = dataclasses.replace(before, errors_nm={"right": 0.008, "left": 0.006})
+    (line,) = [line for line in judge_signs(noisy, after, "counterclockwise", 0.8) if line.verdict == "failed"]
+    assert (line.what, line.value) == ("sign of the estimate of right", "no change beyond 0.045 N·m")
+
+
+def test_a_wrench_whose_noise_hides_the_twist_is_not_measured():
+    errors_nm = {"wrench": 0.02}
+    before, after = Held(0.0, 0.0, 0.0, errors_nm=errors_nm), Held(0.08, 0.05, -0.05, errors_nm=errors_nm)
+    lines = judge_signs(before, after, "counterclockwise", 0.8)
+    assert failed(lines) == []
+    assert [line.verdict for line in lines if line.what == "sign of the wrench"] == ["noted"]
 
 
 def test_emulated_frames_that_a_calibration_refuses_fail_nothing():
     before = Held(0.0, 0.0, 0.0, {"right": 0.0})
-    lines = judge_signs(before, Held(0.08, 0.05, 0.05, {"right": None}), "counterclockwise", emulated=True)
+    lines = judge_signs(before, Held(0.08, 0.05, 0.05, {"right": None}), "counterclockwise", 0.8, emulated=True)
     assert failed(lines) == []
     assert [line.value for line in lines if "right" in line.what] == ["not measured: no estimate in the grip"]
 
 
 def test_a_wrench_that_is_known_to_more_than_the_twist_shows_no_sign():
     before = Held(0.0, 0.0, 0.0)
-    lines = judge_signs(before, Held(0.08, 0.05, -3.0), "counterclockwise", 5.0)
+    lines = judge_signs(before, Held(0.08, 0.05, -3.0), "counterclockwise", 0.8, 5.0)
     assert failed(lines) == []
     assert [line.value for line in lines if line.what == "sign of the wrench"] == [
-        "not measured: the robot estimates its wrench to 5 N·m, and the twist is smaller"
+        "not measured: the robot's wrench is known to 5 N·m, and the twist is smaller"
     ]
-    assert failed(judge_signs(before, Held(0.08, 6.0, -6.0), "counterclockwise", 5.0)) == ["sign of the wrench"]
+    assert failed(judge_signs(before, Held(0.08, 6.0, -6.0), "counterclockwise", 0.8, 5.0)) == ["sign of the wrench"]
 
 
 def held(stiffness: float, left_nm: float = 0.0) -> list[Held]:
@@ -392,8 +413,8 @@ def test_a_lever_that_presses_one_way_is_judged_in_that_direction(way, direction
 
 def test_a_turn_that_a_one_way_load_cell_measures_may_be_clockwise():
     before, after = Held(0.0, 0.0, 0.0), Held(-0.08, -0.05, -0.05)
-    assert failed(judge_signs(before, after, "clockwise", 0.0, -1)) == []
-    assert failed(judge_signs(before, after, "counterclockwise", 0.0, -1)) == ["sign of the command"]
+    assert failed(judge_signs(before, after, "clockwise", 0.8, 0.0, -1)) == []
+    assert failed(judge_signs(before, after, "counterclockwise", 0.8, 0.0, -1)) == ["sign of the command"]
 
 
 def felt(scale: float | None) -> list[Held]:

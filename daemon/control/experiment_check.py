@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from itertools import repeat
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.config import DaemonConfig
@@ -22,11 +23,14 @@ from shearloop.daemon.control.experiment_schema import (
     TurnToStep,
     TwistingStep,
     TwistStep,
+    is_whole,
     outline,
 )
+from shearloop.daemon.control.known_tool import NOTHING_KNOWN
 from shearloop.daemon.control.step_demands import demand
+from shearloop.daemon.control.turns import Turn, turns
 from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
-from shearloop.daemon.torques import BOTH_DIRECTIONS, LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
+from shearloop.daemon.torques import LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
 from shearloop.drivers.robotiq.models import GripperModel
 from shearloop.drivers.ur.settings import UrLimits
 from shearloop.estimation import Measured
@@ -49,9 +53,8 @@ def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[
     why = "its calibration has the other one alone; calibrate on twists both ways"
     if driving.name == LOAD_CELL:
         why = "its lever presses the other way alone, by `load_cell.direction`; turn that way"
-    for number, step in enumerate(file.steps):
-        turned = _loads(step)
-        if other is not None and turned is not None and other in turned:
+    for number, (step, turn) in enumerate(_with_turns(file)):
+        if turn is not None and other in turn.asks_for:
             yield (
                 number,
                 f"{step.do} turns {other}, and {driving.name} measures no torque of this direction: {why}, or let "
@@ -59,27 +62,18 @@ def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[
             )
 
 
-def _loads(step: Step) -> frozenset[Direction] | None:
-    """Return the directions in which a step loads the tool; None where the angle before decides it."""
-    directions: set[Direction | None] = set()
-    match step:
-        case HoldTorqueStep(signed_torque_nm=torque_nm):
-            directions = {direction_of(torque_nm)}
-        case TightenStep(direction=direction):
-            directions = {direction}
-        case IdentifyStep():
-            directions = {"counterclockwise"}
-        case TwistStep(absolute=False, angles_rad=angles_rad):
-            directions = {direction_of(angle_rad) for angle_rad in angles_rad}
-        case TwistStep():
-            return None
-    return frozenset(direction for direction in directions if direction is not None)
+def _with_turns(file: ExperimentFile) -> Iterator[tuple[Step, Turn | None]]:
+    """Yield each step and what it turns; None for each where a step lacks a key, for which the file is refused.
+
+    Nothing is known of the start: a tool may be held then, turned and loaded.
+    """
+    known = turns(file, NOTHING_KNOWN) if is_whole(file) else repeat(None)
+    return zip(file.steps, known, strict=False)
 
 
-def _capped_nm(file: ExperimentFile, step: Step, cap: MotionCap) -> float:
-    """Return the largest torque limit of a step; where its direction is not known, that of both directions."""
-    directions = _loads(step)
-    return cap.torque_nm_of(file.torque_source, BOTH_DIRECTIONS if directions is None else directions)
+def _capped_nm(file: ExperimentFile, turn: Turn, cap: MotionCap) -> float:
+    """Return the largest torque limit of a step."""
+    return cap.torque_nm_of(file.torque_source, turn.may_load)
 
 
 def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mistake]:
@@ -90,8 +84,8 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
     """
     found: list[Mistake] = list(_undoing(file))
     identified = gripped = False
-    for number, step in enumerate(file.steps):
-        found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, cap)]
+    for number, (step, turn) in enumerate(_with_turns(file)):
+        found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, turn, cap)]
         if isinstance(step, GripperStep):
             gripped = isinstance(step, GripStep) and step.expect_object
         if gripped and isinstance(step, TareStep):
@@ -110,12 +104,12 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
     return found
 
 
-def _beyond_own_limits(file: ExperimentFile, step: Step, cap: MotionCap | None) -> Iterator[str]:
+def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap: MotionCap | None) -> Iterator[str]:
     """Yield what a step asks for beyond its limits and its timeout, each with a cure."""
     limits, needs = file.limits_of(step), demand(step)
     if needs.torque_nm >= limits.torque_nm:
         cure = "raise limits.torque_nm, or ask for less"
-        if cap is not None and limits.torque_nm + _ROUNDING >= _capped_nm(file, step, cap):
+        if cap is not None and turn is not None and limits.torque_nm + _ROUNDING >= _capped_nm(file, turn, cap):
             # A larger limit is refused too.
             cure = f"ask for less, because {cap.sentence}"
         yield f"{step.do} asks for {needs.torque_nm:g} N·m, and its limit is {limits.torque_nm:g} N·m; {cure}"
@@ -162,13 +156,14 @@ def check_devices(
     Nothing of these is clipped, because another pose than the written one may be anywhere. `cap` is of the robot's
     commissioning: a step that asks for more than it is refused too.
     """
-    for number, step in enumerate(file.steps):
-        for outside in (_outside_robot(step, robot), _outside_gripper(step, gripper), _beyond_cap(file, step, cap)):
+    for number, (step, turn) in enumerate(_with_turns(file)):
+        beyond = (_outside_robot(step, robot), _outside_gripper(step, gripper), _beyond_cap(file, step, turn, cap))
+        for outside in beyond:
             if outside:
                 yield (("steps", number), f"{step.do} {outside}")
 
 
-def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
+def _beyond_cap(file: ExperimentFile, step: Step, turn: Turn | None, cap: MotionCap | None) -> str:
     """Return which speed or torque of a step the robot's commissioning does not allow, or an empty string."""
     if cap is None:
         return ""
@@ -180,12 +175,21 @@ def _beyond_cap(file: ExperimentFile, step: Step, cap: MotionCap | None) -> str:
     for key, most, unit in speeds:
         if hasattr(step, key) and _is_beyond(getattr(step, key), most):
             return f"has {key} {getattr(step, key):g} {unit}: write {most:g} or less, because {cap.sentence}"
-    if isinstance(step, TwistingStep):
-        limit_nm, most_nm = file.limits_of(step).torque_nm, _capped_nm(file, step, cap)
+    if turn is not None and (turn.turns_tool or turn.may_load):
+        limit_nm, most_nm = file.limits_of(step).torque_nm, _capped_nm(file, turn, cap)
         if _is_beyond(limit_nm, most_nm):
             cure = f"write {most_nm:g} or less, and ask for less than {most_nm:g} N·m"
-            return f"has limits.torque_nm {limit_nm:g} N·m: {cure}, because {cap.sentence}"
+            has = f"has limits.torque_nm {limit_nm:g} N·m{_loads_beyond(file, turn, cap)}"
+            return f"{has}: {cure}, because {cap.sentence}"
     return ""
+
+
+def _loads_beyond(file: ExperimentFile, turn: Turn, cap: MotionCap) -> str:
+    """Return the direction of a step in which a report does not raise the torque, in words; empty without one."""
+    beyond = turn.may_load - cap.torque_directions
+    if file.torque_source not in cap.torque_sources or not beyond:
+        return ""
+    return f", and may load the tool {' or '.join(sorted(beyond))}"
 
 
 def _is_beyond(value: float, most: float) -> bool:

@@ -313,3 +313,12 @@ def _outlined(content: object) -> Step:
         names = {key: given[key] for key in ("do", "fingertip", "reference") if isinstance(given.get(key), str)}
         step: Step = STEP_KINDS.get(names.get("do", ""), WaitStep).model_construct(**names)
         return step
+
+
+def is_whole(file: ExperimentFile) -> bool:
+    """Return whether each step of an outline has the keys that it needs."""
+    for step in file.steps:
+        needed = {name for name, field in type(step).model_fields.items() if field.is_required()}
+        if not needed <= step.model_fields_set:
+            return False
+    return True

@@ -5,6 +5,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
+    ApproachStep,
     ExperimentFile,
     HoldTorqueStep,
     IdentifyStep,
@@ -15,8 +16,18 @@ from shearloop.daemon.control.experiment_schema import (
     TwistingStep,
     TwistStep,
 )
-from shearloop.daemon.control.known_tool import AT_REST, STILL, Held, Interval, KnownTool, Ways, known_after, way_from
-from shearloop.daemon.torques import Direction, direction_of
+from shearloop.daemon.control.known_tool import (
+    AT_REST,
+    STILL,
+    Held,
+    Interval,
+    KnownTool,
+    Ways,
+    known_after,
+    opposite,
+    way_from,
+)
+from shearloop.daemon.torques import BOTH_DIRECTIONS, Direction, direction_of
 
 
 def only_way(ways: Ways) -> Direction | None:
@@ -40,14 +51,17 @@ class Turn(NamedTuple):
     """What a step turns: in which directions its first turn may be, and the last one of those that it leaves.
 
     A step that returns to where it began leaves no turn. `loads` is the direction of the torque or the angle that it
-    leaves, None where that is as before. `reach_rad` bounds the angle since the grip; infinite where it is unknown.
-    `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it does so by an angle, with a torque that is not
-    known before.
+    leaves, None where that is as before. `asks_for` are those of all torques, or of all angles since the grip, that it
+    asks for. `may_load` are the directions of all torques that it may put on a held tool. `reach_rad` bounds the angle
+    since the grip; infinite where it is unknown. `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it
+    does so by an angle, with a torque that is not known before.
     """
 
     begins: Ways
     leaves: Ways
     loads: Direction | None
+    asks_for: frozenset[Direction]
+    may_load: frozenset[Direction]
     reach_rad: Interval
     turns_tool: bool
     by_angle: bool
@@ -94,7 +108,48 @@ def _turn_of(step: Step, before: KnownTool, after: KnownTool) -> Turn:
         case IdentifyStep(amplitude_rad=amplitude_rad):
             leaves = STILL
             reach_rad = Interval(reach_rad.low, reach_rad.high + amplitude_rad)
-    return Turn(begins, leaves, loads, reach_rad, turns_tool, by_angle)
+    asks_for = _asks_for(step, before)
+    may_load = _may_load(step, before, begins, asks_for)
+    return Turn(begins, leaves, loads, asks_for, may_load, reach_rad, turns_tool, by_angle)
+
+
+def _asks_for(step: Step, before: KnownTool) -> frozenset[Direction]:
+    """Return the directions of the torques, or of the angles since the grip, that a step asks for."""
+    directions: set[Direction | None] = set()
+    match step:
+        case HoldTorqueStep(signed_torque_nm=torque_nm):
+            directions = {direction_of(torque_nm)}
+        case TightenStep(direction=direction):
+            directions = {direction}
+        case IdentifyStep():
+            directions = {"counterclockwise"}
+        case TwistStep():
+            directions = {direction_of(angle_rad) for angle_rad in _since_grip(step, before) or ()}
+    return _without_none(directions)
+
+
+def _may_load(step: Step, before: KnownTool, begins: Ways, asks_for: frozenset[Direction]) -> frozenset[Direction]:
+    """Return in which directions a step may load a held tool.
+
+    A step that asks for a torque turns the other way only to lower it. Any other turn counts in its own direction,
+    because a tool that has slipped is loaded the other way before the wrist is back.
+    """
+    match step:
+        case HoldTorqueStep() | TightenStep():
+            return asks_for
+        case IdentifyStep():
+            return BOTH_DIRECTIONS
+        case ApproachStep() if before.held is not Held.NO:
+            return BOTH_DIRECTIONS
+        case TwistStep(angles_rad=angles_rad):
+            rounds = angles_rad * min(step.repeats, 2)
+            ways = begins.union(ways_between(rounds))
+            return _without_none(ways | opposite(ways) if step.return_to_start else ways)
+    return _without_none(begins)
+
+
+def _without_none(ways: Iterable[Direction | None]) -> frozenset[Direction]:
+    return frozenset(way for way in ways if way is not None)
 
 
 def _begins(step: Step, before: KnownTool) -> Ways:
@@ -136,12 +191,18 @@ def _tightens(direction: Direction, until_nm: float, torque_nm: Interval) -> Way
 
 def _reach(step: TwistStep, before: KnownTool, after: KnownTool) -> Interval:
     """Return the bounds of the angle since the grip in a twist."""
-    angles_rad = step.angles_rad
-    if step.absolute:
-        if before.origin_rad is None:
-            return after.angle_rad
-        angles_rad = tuple(angle_rad - before.origin_rad for angle_rad in angles_rad)
+    angles_rad = _since_grip(step, before)
+    if angles_rad is None:
+        return after.angle_rad
     return after.angle_rad.up_to(min(angles_rad)).up_to(max(angles_rad))
+
+
+def _since_grip(step: TwistStep, before: KnownTool) -> tuple[float, ...] | None:
+    """Return the angles of a twist from the grip; None for those of a wrist joint whose angle there is not known."""
+    if not step.absolute:
+        return step.angles_rad
+    origin_rad = before.origin_rad
+    return None if origin_rad is None else tuple(angle_rad - origin_rad for angle_rad in step.angles_rad)
 
 
 def _last_way(angles_rad: tuple[float, ...]) -> Direction | None:

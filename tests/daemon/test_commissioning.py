@@ -469,30 +469,78 @@ def test_an_experiment_that_twists_away_from_a_one_way_lever_is_refused(tmp_path
     assert ("turns clockwise, and load_cell measures no torque" in capsys.readouterr().err) == (status == 2)
 
 
+RELEASE, GRIP, CCW, CW = {"do": "release"}, {"do": "grip"}, "counterclockwise", "clockwise"
+TIGHTEN = {"do": "tighten", "until_torque_nm": 0.32, "until_angle_rad": 0.6, "direction": CCW}
+IDENTIFY = {"do": "identify", "limits": {"torque_nm": 0.3}}
+
+
+def twist_to(*angles_rad: float, **keys: object) -> dict[str, object]:
+    return {"do": "twist", "angles_rad": list(angles_rad), "return_to_start": False, **keys}
+
+
 @pytest.mark.parametrize(
-    ("step", "status"),
+    ("steps", "refused"),
     [
-        ({"do": "twist", "angles_rad": [0.1]}, 0),
-        ({"do": "twist", "angles_rad": [0.1, -0.1]}, 2),
-        ({"do": "twist", "angles_rad": [0.1], "absolute": True}, 2),
-        ({"do": "tighten", "until_torque_nm": 0.32, "until_angle_rad": 0.5, "direction": "counterclockwise"}, 0),
-        ({"do": "tighten", "until_torque_nm": 0.32, "until_angle_rad": 0.5, "direction": "clockwise"}, 2),
+        ([RELEASE, GRIP, twist_to(0.1)], ""),
+        ([RELEASE, GRIP, twist_to(0.1, 0.2), twist_to(0.3)], ""),
+        ([RELEASE, GRIP, IDENTIFY, {"do": "hold_torque", "torque_nm": 0.32}], ""),
+        ([TIGHTEN], ""),
+        ([GRIP, TIGHTEN, {"do": "hold_torque", "torque_nm": 0.0}], "hold_torque needs an identified tool"),
+        # A tool may be held, and turned, before the start.
+        ([twist_to(0.1)], "twist has limits.torque_nm 0.35 N·m, and may load the tool clockwise: write 0.3 or less"),
+        ([GRIP, twist_to(0.1)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.1, return_to_start=True)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.1, -0.1)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.5, 0.1)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.1, 0.5, repeats=2)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.5), twist_to(0.1)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, TIGHTEN, twist_to(0.1)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, twist_to(0.1, absolute=True)], "twist has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, {"do": "identify"}], "identify has limits.torque_nm 0.35 N·m"),
+        ([TIGHTEN | {"direction": CW}], "tighten has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, IDENTIFY, {"do": "hold_torque", "torque_nm": -0.1}], "hold_torque has limits.torque_nm"),
+        ([RELEASE, GRIP, {"do": "turn_to", "angle_rad": 1.0}], "turn_to has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, GRIP, {"do": "approach", "along_tool_m": 0.01}], "approach has limits.torque_nm 0.35 N·m"),
+        ([RELEASE, {"do": "turn_to", "angle_rad": 1.0}, {"do": "approach", "along_tool_m": 0.01}, GRIP, TIGHTEN], ""),
     ],
 )
-def test_a_one_way_lever_raises_the_torque_of_its_direction_alone(tmp_path, capsys, step, status):
+def test_a_one_way_lever_raises_the_torque_of_its_direction_alone(tmp_path, capsys, steps, refused):
     """The wrench measures both directions, but stage 7 compared one of them."""
     one_way = {"load_cell": {"device": {"serial_number": "7583"}, "direction": "counterclockwise"}}
+    gripper = {"gripper": {"model": "2F-140", "socket": {"host": "192.168.1.10"}}}
     supplies = SUPPLIED.model_copy(update={"torque_sources": {"wrench": ""}})
-    report = report_of(write_rig(tmp_path, **one_way), "013457", supplies)
+    report = report_of(write_rig(tmp_path, **one_way, **gripper), "013457", supplies)
     dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
     save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
-    rig = write_rig(tmp_path, commissioned="report.yaml", **one_way)
+    rig = write_rig(tmp_path, commissioned="report.yaml", **one_way, **gripper)
     path = tmp_path / "one.yaml"
-    content = {"name": "one", "torque_source": "wrench", "limits": {"torque_nm": 0.35}, "steps": [step]}
+    content = {"name": "one", "torque_source": "wrench", "limits": {"torque_nm": 0.35}, "steps": steps}
     path.write_text(yaml.safe_dump(content))
-    assert main(["check", str(path), "--config", str(rig)]) == status
-    refused = capsys.readouterr().err
-    assert ("0.4 N·m (load_cell, wrench, counterclockwise alone; else 0.3 N·m)" in refused) == (status == 2)
+    assert main(["check", str(path), "--config", str(rig)]) == (2 if refused else 0)
+    printed = capsys.readouterr().err
+    assert refused in printed
+    if "limits.torque_nm" in refused:
+        assert "0.4 N·m (load_cell, wrench, counterclockwise alone; else 0.3 N·m)" in printed
+
+
+@pytest.mark.parametrize(
+    ("steps", "refused"),
+    [
+        ([GRIP, {"do": "turn_to", "angle_rad": 1.0}], "turn_to has limits.torque_nm 5 N·m: write 0.3 or less"),
+        ([{"do": "turn_to", "angle_rad": 1.0}], "turn_to has limits.torque_nm 5 N·m: write 0.3 or less"),
+        ([GRIP, {"do": "approach", "along_tool_m": 0.01}], "approach has limits.torque_nm 5 N·m: write 0.3 or less"),
+        ([RELEASE, {"do": "turn_to", "angle_rad": 1.0}, {"do": "approach", "along_tool_m": 0.01}], ""),
+        # A file with a mistake in a step is refused for it, and nothing is said of its turns.
+        ([GRIP, {"do": "turn_to", "angle_rad": "far"}], "steps[1].angle_rad: 'far' is not a number"),
+    ],
+)
+def test_each_step_that_may_turn_or_load_a_held_tool_is_capped(tmp_path, capsys, steps, refused):
+    rig = write_rig(tmp_path, gripper={"model": "2F-140", "socket": {"host": "192.168.1.10"}})
+    path = tmp_path / "one.yaml"
+    content = {"name": "one", "torque_source": "load_cell", "limits": {"torque_nm": 5}, "steps": steps}
+    path.write_text(yaml.safe_dump(content))
+    assert main(["check", str(path), "--config", str(rig)]) == (2 if refused else 0)
+    assert refused in capsys.readouterr().err
 
 
 def test_a_default_that_is_written_out_keeps_the_report(tmp_path):

@@ -14,7 +14,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import NOTHING_KNOWN, TORQUE_TOLERANCE, UNTURNED_RAD, known_at_start
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.turns import reversals, turns
-from shearloop.daemon.torques import SIGNS, direction_of
+from shearloop.daemon.torques import BOTH_DIRECTIONS, SIGNS, direction_of
 
 _SMALL = 1e-9
 
@@ -35,6 +35,8 @@ class Run:
     torque: float = 0.0
     held: bool = True
     moves: list[float] = field(default_factory=list)
+    # The torques after each turn of the present step.
+    torques: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.origin = self.rng.choice([0.0, 0.1, self.rng.uniform(-1.0, 1.0)])
@@ -56,6 +58,7 @@ class Run:
         self.torque += self.stiffness * by
         if abs(self.torque) > self.slips_at:
             self.torque = math.copysign(self.slips_at * self.sliding, self.torque)
+        self.torques.append(self.torque)
 
     def rest(self) -> None:
         """Stand still: the torque falls."""
@@ -63,7 +66,7 @@ class Run:
 
     def do(self, step: Step) -> None:
         """Carry out a step."""
-        self.moves = []
+        self.moves, self.torques = [], []
         match step:
             case steps.TwistStep():
                 self._twist(step)
@@ -89,6 +92,7 @@ class Run:
             case steps.ApproachStep():
                 self.angle += self.rng.uniform(-1.0, 1.0)
                 self.torque = self.rng.uniform(-0.1, 0.1) if self.held else 0.0
+                self.torques.append(self.torque)
             case steps.GripStep() | steps.ReleaseStep():
                 self._fingers(holds=isinstance(step, steps.GripStep))
 
@@ -120,6 +124,7 @@ class Run:
             self.moves.append(by)
             self.angle += by
         self.torque = torque
+        self.torques.append(torque)
         # Corrections of the loop do not count as turns.
         if torque:
             self.angle += math.copysign(self.rng.uniform(0.0, self.creeps), torque)
@@ -253,6 +258,26 @@ def test_a_direction_that_assumes_nothing_holds_for_every_tool_and_every_tighten
                 break
             first = next(iter(ways(run)), None)
             assert first in turn.begins or (first is None and len(turn.begins) == 1), (step, turn)
+
+
+@given(content=st.one_of(_CLAMPED, _GRIPPED), seed=st.integers(0, 2**32))
+@settings(max_examples=300, deadline=None)
+def test_a_step_loads_a_held_tool_only_in_directions_that_it_says(content, seed):
+    """Of each tool: it is turned and loaded at the start, slips and relaxes."""
+    file = _file(content)
+    said = list(turns(file, NOTHING_KNOWN))
+    for number in range(8):
+        run = Run(random.Random(seed + number), clamped=False, reaches=False)
+        run.angle, run.torque = run.rng.choice([0.0, -0.4, 0.4]), run.rng.uniform(-0.05, 0.05)
+        for step, turn in zip(file.steps, said, strict=True):
+            before = run.torque
+            try:
+                run.do(step)
+            except _EndedError:
+                break
+            for direction in BOTH_DIRECTIONS - turn.may_load:
+                most = max(SIGNS[direction] * torque for torque in (0.0, before, *run.torques))
+                assert most <= max(0.0, SIGNS[direction] * before) + _SMALL, (step, turn)
 
 
 def _hold(torque_nm: float) -> dict[str, Any]:

@@ -10,12 +10,9 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.daemon.torques import BOTH_DIRECTIONS, Direction
 from shearloop.drivers.defaults import EMULATED_SERIAL_NUMBER
-from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.models import ModelName
-from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.messages import RobotLostError
 from shearloop.drivers.ur.settings import Bound, UrSettings
-from shearloop.errors import Hint, UserError
+from shearloop.errors import Hint
 
 if TYPE_CHECKING:
     # A rig without a report does not load it.
@@ -214,16 +211,3 @@ def knows_tool(stated_mm: float | None, config: DaemonConfig, robot: Commissioni
     if stated_mm is not None or config.gripper is None:
         return stated_mm is not None
     return config.gripper.calibration is not None or (robot is not None and robot.supplied.widths is not None)
-
-
-def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | None:
-    """Return the gripper's calibration by a report's table, or None without one."""
-    if found.widths is None:
-        return None
-    # Most rigs have a calibration of their own, or no table.
-    from shearloop.drivers.robotiq.width_fit import fit_width
-
-    try:
-        return fit_width(found.widths, model)
-    except DriverError as error:
-        raise UserError(f"the report's table of widths: {error}") from error

@@ -20,7 +20,7 @@ from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.logs import LinkReporter
 from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.motion_cap import Commissioning, measured_widths
+from shearloop.daemon.motion_cap import Commissioning
 from shearloop.daemon.patience import EMULATED_PATIENCE, EMULATED_STALE_S, is_patient, patience_of
 from shearloop.daemon.questions import Question, QuestionChangedError
 from shearloop.daemon.report_in_use import commissioning_of
@@ -29,7 +29,7 @@ from shearloop.daemon.robot_files import RobotFiles
 from shearloop.daemon.sensing.sessions import COMBINED, torque_sources
 from shearloop.daemon.sensors import Sensors, Sessions, build_sensors
 from shearloop.daemon.supervisor import Supervisor, Task
-from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied, measured_widths
 from shearloop.daemon.torques import WRENCH, TorqueSource
 from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.calibration_files import load_device_calibration

@@ -7,8 +7,11 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from shearloop.drivers import ranges
-from shearloop.drivers.robotiq.models import COUNTS_MAX, LARGEST_STROKE_MM
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.models import COUNTS_MAX, LARGEST_STROKE_MM, ModelName
+from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.settings import LONGEST_REACTION_S, RestSpeed
+from shearloop.errors import UserError
 
 # A report raises the wrist's speed to this at most.
 FASTEST_RAD_PER_S: Final = 0.5
@@ -52,3 +55,16 @@ class Supplied(Record):
 
 
 NOTHING_SUPPLIED: Final = Supplied()
+
+
+def measured_widths(found: Supplied, model: ModelName) -> WidthCalibration | None:
+    """Return the gripper's calibration by a report's table, or None without one."""
+    if found.widths is None:
+        return None
+    # Most rigs have a calibration of their own, or no table.
+    from shearloop.drivers.robotiq.width_fit import fit_width
+
+    try:
+        return fit_width(found.widths, model)
+    except DriverError as error:
+        raise UserError(f"the report's table of widths: {error}") from error

@@ -15,12 +15,12 @@ from shearloop.daemon.commissioning_report import Line, Report, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
-from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S, measured_widths
+from shearloop.daemon.motion_cap import CAPPED_M_PER_S, CAPPED_NM, CAPPED_RAD_PER_S
 from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report, old_stages
 from shearloop.daemon.rig import make_loop
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s, source_sha256
-from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
+from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied, measured_widths
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings

@@ -10,10 +10,11 @@ from shearloop.drivers.ur.control_box import ControllerInfo, untested
 from shearloop.drivers.ur.limits import PAYLOAD_KG, slowed_by, tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import InstalledTool, UrSettings
+from shearloop.tools.arm_models import UNKNOWN_ARM, Arm
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
-from shearloop.tools.robot_use import UNKNOWN_ARM, Arm, Registers, program_in_words, used_registers
+from shearloop.tools.robot_use import Registers, program_in_words, used_registers
 
 STAGE = "0 identity"
 CHECKSUM_QUESTION = "The safety checksum, as the pendant shows it at the top right (CB3: under Safety):"

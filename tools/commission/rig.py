@@ -22,6 +22,7 @@ from shearloop.drivers.ur.rtde import has_other_client, register_round_trip
 from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.estimation.skin.calibration import load_calibration
+from shearloop.tools.arm_models import Arm, read_arm
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
 from shearloop.tools.commission.fingers import ConnectedGripper, Gripper
 from shearloop.tools.commission.listening import BoardListener
@@ -29,7 +30,7 @@ from shearloop.tools.commission.mover import Mover, MoverProcess
 from shearloop.tools.commission.observer import Observer
 from shearloop.tools.commission.observer_process import ObserverProcess
 from shearloop.tools.fingertip_table import fingertip_table
-from shearloop.tools.robot_use import Arm, read_arm, read_outputs
+from shearloop.tools.robot_use import read_outputs
 
 
 class Rig(Protocol):

@@ -12,13 +12,13 @@ from shearloop.daemon.commissioning_report import Line
 from shearloop.drivers.ranges import LARGEST_PAYLOAD_KG
 from shearloop.drivers.ur.settings import Six, UrSettings
 from shearloop.errors import UserError
+from shearloop.tools.arm_models import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm
 from shearloop.tools.commission.bounds import LARGEST_M, LARGEST_M_PER_S
 from shearloop.tools.commission.context import Context
 from shearloop.tools.commission.motion import SPEED_RAD_PER_S, TURN_RAD
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.operator import Played
 from shearloop.tools.commission.report import Measured, judged
-from shearloop.tools.robot_use import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm
 
 STAGE: Final = "5 wrench"
 SIGMAS: Final = 5.0

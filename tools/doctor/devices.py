@@ -32,6 +32,7 @@ from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.script import UPPER
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import UserError
+from shearloop.tools.arm_models import Arm, read_arm
 from shearloop.tools.doctor.boards import (
     check_adc,
     check_channels,
@@ -42,7 +43,7 @@ from shearloop.tools.doctor.boards import (
     table_of,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, good, note, split_cure, trouble
-from shearloop.tools.robot_use import ROBOT_TIMEOUT_S, Arm, Registers, read_arm, read_outputs, used_registers
+from shearloop.tools.robot_use import ROBOT_TIMEOUT_S, Registers, read_outputs, used_registers
 from shearloop.tools.task_row import task_row
 
 DAEMON_TIMEOUT_S = 1.0

@@ -43,6 +43,7 @@ from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.emulators.ur_robot import MODE_IDLE, MODE_POWER_OFF, ControllerSpec
 from shearloop.emulators.ur_rtde import variable
 from shearloop.estimation.skin.calibration import load_calibration
+from shearloop.tools.arm_models import Arm
 from shearloop.tools.commission.arrivals import Arrivals
 from shearloop.tools.commission.failing_worker import NO_DEADLINES
 from shearloop.tools.commission.mover import WATCHDOG_WORKER, Mover
@@ -50,7 +51,6 @@ from shearloop.tools.commission.mover_process import CAUSES, WORKERS, Driver
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.watchdog_worker import for_watchdog_alone
 from shearloop.tools.fingertip_table import fingertip_table
-from shearloop.tools.robot_use import Arm
 from tests.drivers.ur import robots
 from tests.drivers.ur.scripted_arm import ScriptedArm
 

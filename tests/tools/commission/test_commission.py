@@ -26,12 +26,12 @@ from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.script import LOWER, UPPER
 from shearloop.drivers.ur.settings import InstalledTool, read_settings
 from shearloop.errors import UserError
+from shearloop.tools.arm_models import UNKNOWN_ARM, Arm
 from shearloop.tools.commission import identity
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
 from shearloop.tools.commission.operator import DeclinedError, Operator
 from shearloop.tools.commission.report import earlier_report, report_for, save_report, with_stage
-from shearloop.tools.robot_use import UNKNOWN_ARM, Arm
 from tests.emulator_process import EmulatorProcess
 from tests.fixtures.robots import TOOL, write_filled_in
 

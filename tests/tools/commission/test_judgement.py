@@ -22,6 +22,7 @@ from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import ForceBound, InstalledTool
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.estimation.skin.calibration import load_calibration
+from shearloop.tools.arm_models import Arm
 from shearloop.tools.commission import boards, tool, wrench
 from shearloop.tools.commission.boards import judge_frames, judge_load
 from shearloop.tools.commission.bounds import LARGEST_RAD, LARGEST_RAD_PER_S, bounded
@@ -52,7 +53,6 @@ from shearloop.tools.commission.wrench import (
     largest_mass_kg,
     least_mass_kg,
 )
-from shearloop.tools.robot_use import Arm
 from tests.drivers.ur.robots import DELIVERED
 from tests.emulators.test_cb3 import SETTINGS as CB3
 

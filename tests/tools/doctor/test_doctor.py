@@ -21,11 +21,11 @@ from shearloop.daemon.running_rig import RunningRig
 from shearloop.drivers.calibration_files import save_calibration
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.tools import doctor, serial_ports
+from shearloop.tools.arm_models import Arm
 from shearloop.tools.doctor import devices
 from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
-from shearloop.tools.robot_use import Arm
 from shearloop.tools.serial_ports import HiddenBoard, SerialPortInfo, access_cure, has_brltty, list_hidden_boards
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from shearloop.drivers.ranges import LARGEST_PAYLOAD_KG
-from shearloop.tools import robot_use
-from shearloop.tools.robot_use import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm, read_arm
+from shearloop.tools import arm_models
+from shearloop.tools.arm_models import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm, read_arm
 
 
 @pytest.mark.parametrize(
@@ -20,7 +20,7 @@ from shearloop.tools.robot_use import SMALLEST_ARM_KG, UNKNOWN_ARM, Arm, read_ar
     ],
 )
 def test_the_dashboard_names_the_arm(monkeypatch, answer, major, arm):
-    monkeypatch.setattr(robot_use, "ask_dashboard", lambda *_: (answer,))
+    monkeypatch.setattr(arm_models, "ask_dashboard", lambda *_: (answer,))
     assert read_arm("127.0.0.9", 1.0, major) == arm
 
 

@@ -106,6 +106,9 @@ class UrArm:
         self._script_port.drain()
         if sample.runtime_state == RUNTIME_PLAYING:
             self._script_port.close()
+        else:
+            # The next program that plays can be another client's.
+            self._answered = False
         read = RtdeSample(
             **vars(sample) | {"wrench": _difference(sample.wrench, self.wrench_zero)},
             read_ns=now_ns,
@@ -281,7 +284,11 @@ class UrArm:
         return done
 
     def has_other_client(self) -> bool:
-        """Return whether another client writes registers that a control program reads, as another daemon does."""
+        """Return whether another client writes registers that a control program reads, as another daemon does.
+
+        Raises:
+            RobotLostError: the controller does not answer.
+        """
         return has_other_client(self._settings.host, self._settings.connect_timeout_s / 8, self._registers)
 
     def ask_dashboard(self, *requests: str) -> str:

@@ -53,7 +53,7 @@ class CommandHandler:
         # Whether messages that came late can be that reason.
         self._disabled_late = False
         self._daemon_alive_ns = now_ns
-        # Whether every sample since our program started shows a program: then it is still ours, also while paused.
+        # Whether the program on the robot is known to be the one that was started here, also while it is paused.
         self._program_is_ours = False
         # Whether a tool may load the wrench, as the daemon says.
         self._held_tool = False
@@ -79,10 +79,20 @@ class CommandHandler:
 
     def take(self, sample: RtdeSample) -> None:
         """Take and judge the robot's latest sample; `request`, `tick` and `state` are about it."""
+        self._program_is_ours = self._program_is_ours and self._shows_same_program(sample)
         self._sample, self._unfit = sample, why_unfit(sample, self._settings)
-        if not (sample.has_program and is_recent(sample, self._settings)):
-            self._program_is_ours = False
         self._executor.take(sample)
+
+    def _shows_same_program(self, sample: RtdeSample) -> bool:
+        """Return whether a sample shows the program of the sample before: nothing can have replaced it in between.
+
+        A program that plays after a pause can be another one. So can any program after a time without samples, as
+        during a slow request.
+        """
+        unseen_s = sample.timestamp_s - self._sample.timestamp_s
+        was_seen = is_recent(sample, self._settings) and 0 <= unseen_s <= self._settings.state_timeout_s
+        plays_again = self._sample.program_paused and sample.program_running
+        return sample.has_program and was_seen and not plays_again
 
     def request(self, number: int, command: Command | Heartbeat, now_ns: int) -> CommandReply | None:
         """Return the reply to a command; None for a heartbeat, and when `tick` returns it later (`Unlock`)."""
@@ -108,8 +118,7 @@ class CommandHandler:
             case Unlock() if unfit:
                 if not self._executor.why_not_ours:
                     self._executor.disable(unfit)
-                timeout_s, ours = self._settings.recover_timeout_s, self._program_is_ours
-                self._recovery = Recovery(self._arm, now_ns, timeout_s, number, ours=ours)
+                self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, number)
                 self._recovery.held = self._held_tool
                 return None
             case _ if self._recovery is not None:
@@ -166,8 +175,8 @@ class CommandHandler:
             self._arm.withdraw_deadline()
         recovery = self._recovery
         if recovery is not None:
-            recent = is_recent(sample, self._settings)
-            return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent) else None
+            recent, ours = is_recent(sample, self._settings), self._program_is_ours
+            return self._end_recovery(recovery) if recovery.advance(sample, now_ns, recent=recent, ours=ours) else None
         unfit = self._why_unsent
         if unfit:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.

@@ -30,6 +30,9 @@ STARTS_WITHIN_S, UPLOAD_AGAIN_S = 6.0, 3.0
 # An arm that does not come to rest has no load that could be measured for longer than this.
 LOAD_WITHIN_S = 5.0
 
+# Messages at the pendant keep the program from starting.
+_CLOSE_POPUPS = ("close popup", "close safety popup")
+
 NOT_STARTING = (
     "The controller took the control program and does not play it: look at the teach pendant for a message, for local "
     "control, and for the log's last lines. The robot's worker is started again with motion disabled."
@@ -38,6 +41,10 @@ ANOTHERS_PROGRAM = (
     "The program on the robot may be another daemon's: another client writes the robot's input registers. An "
     "unlock would bypass a stop that waits there. End the other daemon, or stop the program at the pendant, then "
     "unlock again."
+)
+WHOSE_PROGRAM = (
+    "{error} So it is not known whether the program on the robot is another daemon's, and nothing is done to it. "
+    "Unlock again."
 )
 
 
@@ -48,13 +55,8 @@ class Recovery:
     unlocked only on the operator's request (UR's own rule). Without one, only the control program is started.
     """
 
-    def __init__(
-        self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None, *, ours: bool = False
-    ) -> None:
-        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping a program.
-
-        `ours`: the program that is on the robot now was started by this worker.
-        """
+    def __init__(self, arm: "UrArm", now_ns: int, timeout_s: float, unlock_number: int | None = None) -> None:
+        """Begin. The number of an operator's `Unlock` allows unlocking, powering and stopping a program."""
         self.unlock_number = unlock_number
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
@@ -63,9 +65,11 @@ class Recovery:
         self._modes_seen: set[int] = set()
         self._load_by_ns = now_ns + int(LOAD_WITHIN_S * 1e9)
         self._asked_ns: dict[str, int] = {}
+        # The requests that the dashboard was sent.
+        self._sent: set[str] = set()
         self._cleared = False
-        # Whether the program that is on the robot may be another client's; None until it was asked.
-        self._others = False if ours else None
+        # Since when the program on the robot is left alone.
+        self._left_alone_ns: int | None = None
         # When the control program was first sent.
         self._uploaded_ns: int | None = None
         # The controller's latest refusal of a request that could be done without.
@@ -87,8 +91,10 @@ class Recovery:
         """End the attempt."""
         self.refusal = reason
 
-    def advance(self, sample: RtdeSample, now_ns: int, *, recent: bool) -> bool:
+    def advance(self, sample: RtdeSample, now_ns: int, *, recent: bool, ours: bool) -> bool:
         """Do the step that is due in this cycle, unless the sample is old; return whether the attempt has ended.
+
+        `ours`: the program that the sample shows is known to be the one that this worker started.
 
         Raises:
             RobotLostError: the control program cannot be sent, or does not start.
@@ -102,36 +108,26 @@ class Recovery:
                 f"{sample.robot_mode_name}, safety mode: {sample.safety_mode_name}, program: {sample.runtime_name}). "
                 f"{self._answered}Look at the teach pendant."
             )
+        if sample.runtime_state == RUNTIME_STOPPED:
+            self._left_alone_ns = None
         if self.refusal is None and recent:
-            try:
-                self._step(sample, now_ns)
-            except RobotLostError:
-                raise
-            except DriverError as error:
-                self.refusal = str(error)
+            self._step(sample, now_ns, ours=ours)
         return self.ready or self.refusal is not None
 
-    def _step(self, sample: RtdeSample, now_ns: int) -> None:
-        if self.operator_asked and self._uploaded_ns is None and sample.has_program:
-            if self._others is None:
-                self._others = self._arm.has_other_client()
-            if self._others:
-                self._wait_for_its_end(sample, now_ns)
-                return
+    def _step(self, sample: RtdeSample, now_ns: int, *, ours: bool) -> None:
         safe = sample.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
         if not (safe and sample.robot_mode == ROBOT_MODE_RUNNING):
-            self._make_safe(sample, now_ns, safe)
-            return
-        self._close_popups(now_ns)
-        if self._uploaded_ns is not None and sample.program_running:
+            self._make_safe(sample, now_ns, safe=safe, ours=ours)
+        elif self._popups_may_be_open:
+            self._ask_dashboard(sample, now_ns, *_CLOSE_POPUPS, ours=ours)
+        elif self._uploaded_ns is not None and sample.program_running:
             # The control connection may see the program a sample later; then try again in the next cycle.
             self.ready = self._arm.arm_watchdog()
         elif sample.runtime_state != RUNTIME_STOPPED:
             if self.operator_asked:
-                self._ask_dashboard(now_ns, "stop")
-            elif now_ns > self._asked_ns.setdefault("end", now_ns) + int(ENDS_ITSELF_S * 1e9):
-                # Not ours to stop. After the death of its daemon its watchdog would have ended it.
-                self.refusal = ""
+                self._ask_dashboard(sample, now_ns, "stop", ours=ours)
+            else:
+                self._leave_alone(sample, now_ns)
         elif not self._cleared:
             # Registers outlive the program: a new one would first execute the last command.
             self._cleared = self._arm.clear_command()
@@ -149,40 +145,69 @@ class Recovery:
             if self._is_due("upload", now_ns, UPLOAD_AGAIN_S):
                 self._arm.upload(held=self.held)
 
-    def _make_safe(self, sample: RtdeSample, now_ns: int, safe: bool) -> None:
+    def _make_safe(self, sample: RtdeSample, now_ns: int, *, safe: bool, ours: bool) -> None:
         if not self.operator_asked:
             self.refusal = ""
         elif sample.emergency_stop:
             self.refusal = "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
         elif sample.protective_stop:
             # Once: the controller refuses it in the first 5 s.
-            if "unlock protective stop" not in self._asked_ns:
-                self._ask_dashboard(now_ns, "unlock protective stop")
+            if "unlock protective stop" not in self._sent:
+                self._ask_dashboard(sample, now_ns, "unlock protective stop", ours=ours)
         elif not safe:
             self.refusal = (
                 f"The safety mode “{sample.safety_mode_name}” cannot be cured from here: look at the pendant."
             )
-        else:
-            self._close_popups(now_ns)
-            if sample.robot_mode == ROBOT_MODE_POWER_OFF:
-                self._ask_dashboard(now_ns, "power on")
-            elif sample.robot_mode == ROBOT_MODE_IDLE:
-                self._ask_dashboard(now_ns, "brake release")
+        elif self._popups_may_be_open:
+            self._ask_dashboard(sample, now_ns, *_CLOSE_POPUPS, ours=ours)
+        elif sample.robot_mode == ROBOT_MODE_POWER_OFF:
+            self._ask_dashboard(sample, now_ns, "power on", ours=ours)
+        elif sample.robot_mode == ROBOT_MODE_IDLE:
+            self._ask_dashboard(sample, now_ns, "brake release", ours=ours)
 
-    def _wait_for_its_end(self, sample: RtdeSample, now_ns: int) -> None:
-        """Leave a program to another client, whose own stop may wait for its operator."""
-        begun_ns = self._asked_ns.setdefault("end", now_ns)
-        # A program that plays ends by itself if its worker has ended. A paused one does not.
-        if sample.program_paused or now_ns > begun_ns + int(ENDS_ITSELF_S * 1e9):
-            self.refusal = ANOTHERS_PROGRAM
+    @property
+    def _popups_may_be_open(self) -> bool:
+        return self.operator_asked and _CLOSE_POPUPS[0] not in self._sent
 
-    def _close_popups(self, now_ns: int) -> None:
-        if self.operator_asked and "close popup" not in self._asked_ns:
-            self._ask_dashboard(now_ns, "close popup", "close safety popup")
+    def _ask_dashboard(self, sample: RtdeSample, now_ns: int, *requests: str, ours: bool) -> None:
+        """Have the dashboard carry out requests, unless the program on the robot may be another client's.
 
-    def _ask_dashboard(self, now_ns: int, *requests: str) -> None:
-        if self._is_due(requests[0], now_ns) and (refused := self._arm.ask_dashboard(*requests)):
+        That is asked right before each request: another program can begin at any time. A cycle asks the dashboard once,
+        because its answer may come after seconds.
+        """
+        if self._left_alone_ns is not None:
+            self._leave_alone(sample, now_ns)
+            return
+        if not self._is_due(requests[0], now_ns):
+            return
+        if sample.runtime_state != RUNTIME_STOPPED and not ours:
+            try:
+                is_anothers = self._arm.has_other_client()
+            except RobotLostError as error:
+                self.refusal = WHOSE_PROGRAM.format(error=error)
+                return
+            if is_anothers:
+                self._leave_alone(sample, now_ns)
+                return
+        try:
+            refused = self._arm.ask_dashboard(*requests)
+        except DriverError as error:
+            self.refusal = str(error)
+            return
+        self._sent.add(requests[0])
+        if refused:
             self._answered = f"{refused}. "
+
+    def _leave_alone(self, sample: RtdeSample, now_ns: int) -> None:
+        """Wait for the end of a program that may be another client's: its own stop may wait for its operator.
+
+        A program that plays ends by itself, by its watchdog, if its worker has ended. A paused one does not.
+        """
+        if self._left_alone_ns is None:
+            self._left_alone_ns = now_ns
+        waited = now_ns > self._left_alone_ns + int(ENDS_ITSELF_S * 1e9)
+        if waited or (self.operator_asked and sample.program_paused):
+            self.refusal = ANOTHERS_PROGRAM if self.operator_asked else ""
 
     def _is_due(self, step: str, now_ns: int, period_s: float = _RETRY_S) -> bool:
         """Return whether a step is due, and note that it is taken: the robot may not follow a request at once."""

@@ -306,8 +306,8 @@ def moving(cycles: int) -> HandlerBench:
     return bench
 
 
-def turning(speed: float = 0.5) -> HandlerBench:
-    bench = enabled()
+def turning(speed: float = 0.5, arm: FakeArm | None = None) -> HandlerBench:
+    bench = enabled(arm=arm)
     assert bench.ask(messages.WristSpeed(speed, 4.0)).accepted
     bench.run(30)
     assert bench.wrist_speed == pytest.approx(speed)

@@ -272,6 +272,23 @@ def test_the_wait_for_the_load_of_a_new_program_takes_one_command_and_then_heart
     assert sent == ["setWatchdog"] + ["kickWatchdog"] * round(SETTINGS.rate_hz)
 
 
+def test_a_program_that_plays_after_ours_has_to_answer_too(arm, monkeypatch):
+    """It can be another daemon's, and ur-rtde sends it a heartbeat in any case."""
+    monkeypatch.setattr(arm.ScriptPort, "send", lambda *_: None)
+    one = arm.UrArm(SETTINGS)
+    one.upload(held=True)
+    Receiver.made.sample = received(2.0)
+    one.read()
+    assert not one.arm_watchdog(), "it answers, and its zero is measured first"
+    Receiver.made.sample = received(2.1, runtime_state=1)
+    one.read()
+    rest(one, 3.0, SIX)
+    Client.made.calls.clear()
+    one.script_readiness.waiting = False
+    assert not one.arm_watchdog()
+    assert Client.made.calls == ["setWatchdog"]
+
+
 def test_a_sample_that_is_read_twice_is_measured_once(arm):
     """Each command reads the latest sample again: half a second of samples would pass for a second."""
     one = arm.UrArm(SETTINGS)

@@ -87,45 +87,6 @@ def test_resumed_program_does_not_move_and_gets_no_heartbeats():
     assert bench.ask(Unlock()).accepted
 
 
-@pytest.mark.parametrize("runtime_state", [2, 3, 4, 5], ids=["playing", "pausing", "paused", "resuming"])
-@pytest.mark.parametrize(
-    "modes",
-    [{}, {"safety_mode": 3}, {"robot_mode": 3}, {"robot_mode": 5}],
-    ids=["normal", "protective stop", "power off", "brakes"],
-)
-def test_an_unlock_leaves_alone_what_another_daemon_runs_whose_stop_may_wait(runtime_state, modes):
-    """Another daemon keeps its program alive, and a stop of the robot leaves it paused."""
-    bench = HandlerBench()
-    bench.arm.other_client = True
-    bench.arm.be(runtime_state=runtime_state, **modes)
-    bench.run(60)
-    reply = bench.ask(Unlock())
-    assert "may be another daemon's: another client writes the robot's input registers" in reply.refusal
-    assert bench.arm.calls == [], "nothing is stopped, unlocked or powered"
-    assert bench.arm.reading.has_program
-    bench.arm.end_program()
-    assert bench.ask(Unlock()).accepted
-
-
-def test_a_paused_program_of_our_own_is_ended_beside_a_fieldbus_that_writes_registers():
-    bench = turning()
-    bench.arm.other_client = True
-    bench.arm.protective_stop()
-    bench.run(100)
-    assert bench.ask(Unlock()).accepted
-
-
-@pytest.mark.parametrize("unknown", [{"runtime_state": 1}, {"age_ns": 300_000_000}], ids=["stopped", "old"])
-def test_a_program_after_ours_may_be_anothers(unknown):
-    bench = turning()
-    bench.arm.other_client = True
-    bench.arm.be(**unknown)
-    bench.run(5)
-    bench.arm.be(age_ns=0, runtime_state=4)
-    bench.run(5)
-    assert "may be another daemon's" in bench.ask(Unlock()).refusal
-
-
 def test_program_left_behind_ends_before_ours_starts():
     bench = HandlerBench()
     bench.arm.be(runtime_state=2)

@@ -110,14 +110,15 @@ class SafetyMonitor:
 
     def report(self, faults: Iterable[Fault]) -> SafetyDecision:
         """Return the faults while nothing moves: a pending stop is kept, and only the robot's own stops begin one."""
+        before = {fault.code for fault in self._active or ()}
         active = self._active = tuple(faults)
         self._reset_timers()
         for fault in active:
-            if fault.rule.stops_at_rest:
-                # One that lasts is one cause, in its first words: while it is unlocked, the robot says how far it is.
-                known = self._waiting_fault(fault.code)
-                self._causes += known is None
-                self._join(known or fault)
+            # One that lasts is one cause, in its first words: while it is unlocked, the robot says how far it is.
+            lasts = fault.code in before and self._waiting_fault(fault.code) is not None
+            if fault.rule.stops_at_rest and not lasts:
+                self._causes += 1
+                self._join(fault)
         return SafetyDecision(Response.NOTE, active) if self.waiting is None else self._with_stop(self.waiting, active)
 
     def stop(self, fault: Fault) -> None:
@@ -132,10 +133,12 @@ class SafetyMonitor:
         return next((one for one in waiting if one.code is code), None)
 
     def _join(self, fault: Fault) -> None:
-        """Let a fault join the stop that waits, or begin one."""
+        """Let a fault join the stop that waits, or begin one; of each code, the first and the latest one are kept."""
         stop = self.waiting or Stop(Response.STOP_AND_KEEP_GRIP, (), self._causes)
-        others = (one for one in stop.faults if one.code is not fault.code)
-        self.waiting = replace(stop, faults=(*others, fault), number=self._causes)
+        first = self._waiting_fault(fault.code)
+        kept = tuple(one for one in stop.faults if one.code is not fault.code or one is first)
+        faults = kept if fault in kept else (*kept, fault)
+        self.waiting = replace(stop, faults=faults, number=self._causes)
 
     def release_once(self) -> bool:
         """Return whether the stop that waits has to open the gripper now; it counts as done."""

@@ -1,4 +1,5 @@
 import string
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -70,6 +71,38 @@ def test_a_stop_has_a_larger_number_after_each_further_cause_and_not_while_one_l
     assert gate.judge([trouble(FaultCode.TORQUE_LIMIT)], 0).response in STOPS
     gate.judge([trouble(FaultCode.TORQUE_LIMIT)], SECOND)
     assert gate.stop_number == 4
+
+
+@pytest.mark.parametrize("code", [FaultCode.PROTECTIVE_STOP, FaultCode.EMERGENCY_STOP])
+@pytest.mark.parametrize("is_remembered", [False, True])
+def test_a_second_stop_of_the_robot_at_rest_is_a_cause_of_its_own(code, is_remembered):
+    gate = SafetyMonitor()
+    first, second, third = (Fault(code, f"number {number}") for number in (1, 2, 3))
+    if is_remembered:
+        first = replace(first, when="stopped at 2026-11-30 12:03")
+        gate.stop(first)
+    else:
+        gate.report([first])
+    gate.report([])
+    decision = gate.report([second])
+    assert [fault.detail for fault in decision.reported] == ["number 2"]
+    assert (gate.waiting.causes, gate.stop_number) == (f"{first.cause}; {second.cause}", 2)
+    over = gate.report([]).reported
+    assert [(fault.detail, fault.is_over) for fault in over] == [("number 1", True), ("number 2", True)]
+    # Of many, the first and the latest are named. A person may hit the same obstacle again.
+    gate.report([third])
+    gate.report([])
+    gate.report([third])
+    assert (gate.waiting.faults, gate.stop_number) == ((first, third), 4)
+
+
+def test_a_stop_that_lasts_stays_before_those_that_join_it():
+    gate = SafetyMonitor()
+    protective, operator = trouble(FaultCode.PROTECTIVE_STOP), trouble(FaultCode.OPERATOR_STOP)
+    gate.report([protective])
+    gate.stop(operator)
+    gate.report([protective])
+    assert gate.waiting.faults == (protective, operator)
 
 
 TICK_S = 0.008

@@ -65,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
     label = f"{EMULATED}: " if args.emulate or config.emulated else ""
     terminal = Terminal(sys.stderr if args.json else sys.stdout, label)
     with ExitStack() as emulating:
-        # The lines say what matters here, and a log would stand between questions.
+        # The lines say what matters here. A warning is of a client of the held address alone, and would stand between
+        # questions.
         emulating.enter_context(logging_to_stderr(level=logging.ERROR))
         order = None
         if args.emulate:

@@ -8,7 +8,7 @@ from threading import Thread
 from shearloop.cli.other_daemon import refuse_second_daemon
 from shearloop.daemon.messaging.command_server import STATUS, STOP, Reply, Request
 from shearloop.daemon.messaging.refusals import Refusals
-from shearloop.daemon.messaging.stop_socket import StopSocket
+from shearloop.daemon.messaging.stop_socket import NameTakenError, StopSocket
 from shearloop.errors import UserError
 
 
@@ -16,7 +16,8 @@ from shearloop.errors import UserError
 def held_from_daemons(commands: str, holder: str) -> Iterator[None]:
     """Keep the daemons of every user of this computer away from an address of `commands`, as a daemon does.
 
-    `holder` is the sentence for who asks there meanwhile. Raises UserError if a daemon, or another holder, has it.
+    `holder` is the sentence for who asks there meanwhile. Raises UserError if a daemon, or another holder, has it, or
+    if it cannot be bound.
     """
     refuse_second_daemon(commands, cure="")
 
@@ -25,7 +26,7 @@ def held_from_daemons(commands: str, holder: str) -> Iterator[None]:
 
     try:
         held = StopSocket(commands, {STOP: refuse, STATUS: refuse}, Refusals())
-    except UserError as error:
+    except NameTakenError as error:
         raise UserError(
             f"the stop socket of `commands: {commands}` is taken: a daemon of this or another user has it and does not "
             "answer; `sudo ss -xlp` says who: end it first"

@@ -5,6 +5,7 @@ the address of `commands`. Requests and replies are as on the command server, on
 """
 
 import asyncio
+import errno
 import os
 import socket
 import time
@@ -20,13 +21,17 @@ from shearloop.errors import UserError
 LARGEST_DATAGRAM_BYTES = 1024
 
 
+class NameTakenError(UserError):
+    """Another program has the name of a stop socket."""
+
+
 class StopSocket:
     """Receives requests and sends the replies, one at a time."""
 
     def __init__(
         self, address: str, handlers: Mapping[str, Handler], refusals: Refusals, *, emulated: bool = False
     ) -> None:
-        """Bind the stop socket of the command address; raises UserError if another daemon has it."""
+        """Bind the stop socket of the command address; raises UserError, NameTakenError if another daemon has it."""
         self._address = address
         self._requests = RequestExecutor(handlers, refusals, emulated=emulated)
         self._refusals = refusals
@@ -35,10 +40,13 @@ class StopSocket:
             self._socket.bind(stop_name(address))
         except OSError as error:
             self._socket.close()
-            raise UserError(
-                f"the stop socket of `commands: {address}` cannot be bound ({error.strerror}); is another daemon "
-                "running? Stop it, or choose another port; if another user holds its name, `sudo ss -xlp` says who"
-            ) from error
+            cannot = f"the stop socket of `commands: {address}` cannot be bound ({error.strerror or error})"
+            if error.errno == errno.EADDRINUSE:
+                raise NameTakenError(
+                    f"{cannot}; is another daemon running? Stop it, or choose another port; if another user holds its "
+                    "name, `sudo ss -xlp` says who"
+                ) from error
+            raise UserError(f"{cannot}; choose another address") from error
 
     async def run(self) -> None:
         """Serve requests until cancelled."""

@@ -10,6 +10,7 @@ import pytest
 from shearloop.cli import demo, other_daemon
 from shearloop.cli.held_address import held_from_daemons
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.messaging import stop_socket
 from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.messaging.messages import encode
 from shearloop.daemon.messaging.refusals import Refusals
@@ -90,6 +91,14 @@ def test_a_held_address_answers_after_an_empty_datagram_and_beside_a_client_that
             client.sendto(encode({"command": "stop"}), stop_name(commands))
         reply = send_to_stop_socket(commands, {"command": "status"}, DEADLINE_S)
         assert (reply["ok"], reply["reason"]) == (False, "process 7 has the robot")
+
+
+def test_an_address_that_cannot_be_bound_is_not_called_another_programs(monkeypatch, tmp_path):
+    monkeypatch.setattr(stop_socket, "stop_name", lambda _: f"{tmp_path}/absent/stop")
+    with pytest.raises(UserError) as refused, held_from_daemons("tcp://127.0.0.1:5999", "process 7 has the robot"):
+        pass
+    assert "cannot be bound (No such file or directory)" in str(refused.value)
+    assert "daemon" not in str(refused.value)
 
 
 def test_a_held_address_answers_for_itself_alone():

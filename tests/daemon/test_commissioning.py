@@ -254,18 +254,6 @@ def test_a_rehearsal_continues_a_report_on_the_devices_that_it_is_of(tmp_path):
         assert found.cap.cure == f"{AGAIN}{option} --stages 7`"
 
 
-def test_a_file_that_a_stage_judged_is_hashed_once(tmp_path, monkeypatch):
-    (tmp_path / "cell.yaml").write_text(yaml.safe_dump(CELL))
-    cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
-    save_report(tmp_path / "report.yaml", report_of(write_rig(tmp_path, load_cell=cell), "0134567", SUPPLIED))
-    config = load_daemon_config(write_rig(tmp_path, load_cell=cell, commissioned="report.yaml"))
-    rewrite(tmp_path / "cell.yaml", scale_n_per_count=0.002)
-    read, read_bytes = [], Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: read.append(path.name) or read_bytes(path))
-    assert not commissioning_of(config, read_settings(config.robot), NOW).counts
-    assert read.count("cell.yaml") == 1
-
-
 def rehearsing(folder: Path, report: Report | None, **content: object):
     """Return what a report allows in a rehearsal of a rig, which has other addresses."""
     real = load_daemon_config(write_rig(folder, **content))

@@ -46,7 +46,7 @@ def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
 
 
-def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, monkeypatch, capsys):
+def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, monkeypatch):
     ready = threading.Event()
     monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
@@ -54,8 +54,7 @@ def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, mo
         daemon = pool.submit(main, ["run", str(config())])
         assert ready.wait(DEADLINE_S)
         assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
-        assert daemon.result(DEADLINE_S) == 0
-    assert "stop: nothing was moving; this stop ends the daemon" in capsys.readouterr().out
+        assert daemon.result(DEADLINE_S) == 0, "the stop ended it"
 
 
 class Cycle:

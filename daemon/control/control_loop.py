@@ -276,9 +276,6 @@ class ControlLoop:
         """
         if (reason := self.operator.start_refusal()) is not None:
             return reason
-        if self.inputs.gripper is not None:
-            # What other programs asked for before the start is no fault of this experiment.
-            self.tool.judge(self.inputs.gripper)
         found = detect_faults(self.inputs, self._watched, file.limits, None, t_ns)
         faults = found if is_enabled else self._lasting(found)
         if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
@@ -289,6 +286,9 @@ class ControlLoop:
 
     def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:
         """Begin an experiment; return None, or why it cannot begin; `confirmed` is as in `refusal_of`."""
+        if self.running_experiment is None and self.inputs.gripper is not None:
+            # What other programs asked for before the start is no fault of this experiment.
+            self.tool.judge(self.inputs.gripper)
         if (reason := self.refusal_of(file, t_ns, confirmed=confirmed)) is not None:
             return reason
         driving, speeds = self.sources[file.torque_source], Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)

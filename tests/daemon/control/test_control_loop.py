@@ -1,6 +1,7 @@
 """The control loop when all is well: whole experiments, and what an operator may ask of one."""
 
 import math
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -362,6 +363,38 @@ def test_what_another_program_asked_before_a_start_does_not_stop_it_again():
     assert rig.control_loop.start(again, rig.t_ns) is None
     rig.run(1)
     assert phase(rig) is ExperimentPhase.RUNNING
+
+
+def test_the_question_whether_an_experiment_can_begin_changes_nothing():
+    """A start asks it several times, and the grip of before is judged by the start alone."""
+    judged: list[str] = []
+    rig = started(Rig(new_loop()), GRIP, {"do": "wait", "wait_s": 60})
+    rig.run(2)
+    tool = rig.control_loop.tool
+    tool.restore_grip(tool.grip, judged.append)
+    rig.hand = replace(rig.hand, others_requests=1)
+    rig.step()
+    assert phase(rig) is ExperimentPhase.STOPPED
+    rig.control_loop.acknowledge()
+    before = copy(tool)
+    again = ExperimentFile.model_validate({"name": "again", "steps": [{"do": "wait", "wait_s": 60}]})
+    for _ in range(3):
+        rig.control_loop.refusal_of(again, rig.t_ns)
+    assert (tool, judged) == (before, [])
+    assert rig.control_loop.start(again, rig.t_ns) is None
+    assert judged == ["another program, or the pendant, has commanded it since then"]
+    assert rig.control_loop.start(again, rig.t_ns) == "the experiment 'again' is running; stop it first"
+
+
+def test_a_refused_start_accepts_no_request_of_others_during_an_experiment():
+    rig = started(Rig(new_loop()), {"do": "wait", "wait_s": 60})
+    rig.run(1)
+    rig.hand = replace(rig.hand, others_requests=1)
+    rig.sense(0.0)
+    again = ExperimentFile.model_validate({"name": "again", "steps": [{"do": "wait", "wait_s": 60}]})
+    assert "is running" in rig.control_loop.start(again, rig.t_ns)
+    rig.step()
+    assert phase(rig) is ExperimentPhase.STOPPED
 
 
 @pytest.mark.parametrize("seen_moving", [False, True])

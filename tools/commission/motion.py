@@ -8,7 +8,8 @@ from typing import Final
 
 from shearloop.daemon.commissioning_report import Line, has_failed
 from shearloop.daemon.supplied_values import Supplied
-from shearloop.drivers.ur.limits import ACCELERATION_S
+from shearloop.drivers.ur.limits import ACCELERATION_S, slowed_by
+from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import MIN_REST_RAD_PER_S
 from shearloop.errors import UserError
 from shearloop.tools.commission.bounds import LARGEST_RAD
@@ -27,6 +28,7 @@ TURN_RAD: Final = 0.08
 # In this stage no brake is known yet: the distance also holds one of 0.5 rad/s², an eighth of the usual, and the delay.
 FIRST_TURN_RAD: Final = 0.05
 _SLIDER: Final = 0.5
+_SLIDER_ERROR: Final = 0.2
 _COMES_TO_REST_S: Final = 3.0
 
 
@@ -173,16 +175,25 @@ def _slider(context: Context) -> Line:
         f"Set the speed slider at the pendant to {_SLIDER:.0%}",
         Played("it is set for you", (f"robot slider {_SLIDER:g}",)),
     )
-    context.observer.wait_for(
-        lambda seen: abs(seen.outputs.speed_slider - _SLIDER) < 0.2, context.observer.latest().made_ns, 5.0
-    )
+    context.observer.wait_for(lambda seen: _is_at_half(seen.outputs), context.observer.latest().made_ns, 5.0)
     context.operator.allow(f"a turn of {FIRST_TURN_RAD:g} rad at {SPEED_RAD_PER_S:g} rad/s, which has to be refused")
     refusal = mover.ended(mover.request("turn", rad_per_s=SPEED_RAD_PER_S, to_rad=here_rad + FIRST_TURN_RAD))
+    outputs = context.observer.latest().outputs
     context.operator.act("Set the speed slider back to 100 %", Played("it is set for you", ("robot slider 1",)))
+    return judge_slider(refusal, outputs)
+
+
+def _is_at_half(outputs: RtdeOutputs) -> bool:
+    return abs(outputs.speed_slider - _SLIDER) < _SLIDER_ERROR
+
+
+def judge_slider(refusal: str, outputs: RtdeOutputs) -> Line:
+    """Return the line on the refusal of a motion, by the robot's outputs at this time."""
+    slowed = slowed_by(outputs)
     return judged(
         "slider at 50 %",
         refusal or "it turned",
-        "refused, with the slider's name",
+        "refused because of the slider",
         "the loop's gain",
-        passed="slider" in refusal,
+        passed=_is_at_half(outputs) and slowed is not None and slowed.sentence in refusal,
     )

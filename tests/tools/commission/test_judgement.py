@@ -18,6 +18,7 @@ from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.load_cell import LoadSample
 from shearloop.drivers.robotiq.width_fit import fit_width
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
+from shearloop.drivers.ur.limits import slowed_by
 from shearloop.drivers.ur.messages import RtdeOutputs
 from shearloop.drivers.ur.settings import ForceBound, InstalledTool
 from shearloop.emulators.synthetic_skin import SyntheticSkin
@@ -30,7 +31,7 @@ from shearloop.tools.commission.curves import middle_s, step_s
 from shearloop.tools.commission.gripper import judge_widths
 from shearloop.tools.commission.hand_stops import HandStop, hand_speeds, judge_hand_stops
 from shearloop.tools.commission.limits import EMULATED, REAL, REHEARSED
-from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise
+from shearloop.tools.commission.motion import SIGMAS, Turn, judge_noise, judge_slider
 from shearloop.tools.commission.observer import Seen
 from shearloop.tools.commission.rtde import judge_clock, judge_samples
 from shearloop.tools.commission.skin import judge_pressed, judge_skin, why_not_timed
@@ -136,6 +137,23 @@ def test_a_turn_has_its_delay_speed_and_acceleration():
     assert np.mean(turn.cruise()) == pytest.approx(1.0)
     assert turn.largest_acceleration() == pytest.approx(0.2 / 0.04, rel=0.01)
     assert Turn(0, 0.2, seen[:2]).delay_s(0.004) == math.inf
+
+
+HALVED = dataclasses.replace(AT_REST, speed_slider=0.5)
+
+
+@pytest.mark.parametrize(
+    ("slider", "refusal", "verdict"),
+    [
+        (0.5, slowed_by(HALVED).sentence, "passed"),
+        (0.5, "", "failed"),
+        (0.5, "The program was ended at the pendant, where the speed slider is.", "failed"),
+        (1.0, slowed_by(HALVED).sentence, "failed"),
+    ],
+)
+def test_a_motion_at_half_slider_is_refused_for_the_slider(slider, refusal, verdict):
+    """Another refusal may have the word too."""
+    assert judge_slider(refusal, dataclasses.replace(AT_REST, speed_slider=slider)).verdict == verdict
 
 
 GOOD = Stop("worker killed", 0.15, 0.02, 1, "")

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.cli.terminal import print_result
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.logs import logging_to_stderr
+    from shearloop.daemon.motion_cap import naming
     from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
@@ -84,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
         if settings is not None:
             named = config.model_copy(update={"commissioned": args.out})
             if allowed := commissioning_of(named, settings).sentence:
-                sentences.append(f"{label}With `commissioned: {args.out.resolve()}`, {allowed}.")
+                given = naming(str(args.out.resolve()), rehearsed=args.emulate)
+                sentences.append(f"{label}With {given}, {allowed}.")
     print_result(report.model_dump(mode="json", exclude_none=True), sentences, as_json=args.json)
     return 0 if report.passed else 1
 

@@ -31,17 +31,17 @@ _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
 
 
-def new_report(file: str = "NEW_FILE", *, rehearsed: bool = False) -> str:
-    """Return the cure where no report can be continued.
+def naming(file: str, *, rehearsed: bool) -> str:
+    """Return what gives a report to the daemon; a real rig's configuration would refuse one of emulated devices."""
+    return f"`--set commissioned={file}`" if rehearsed else f"`commissioned: {file}`"
 
-    In a rehearsal one of emulated devices helps. The configuration does not name it, because the real rig would refuse
-    it.
-    """
+
+def new_report(file: str = "NEW_FILE", *, rehearsed: bool = False) -> str:
+    """Return the cure where no report can be continued; in a rehearsal one of emulated devices helps."""
+    named = naming(file, rehearsed=rehearsed)
     if rehearsed:
-        made = f"run `shearloop commission CONFIG --out {file} --emulate`"
-        return f"{made}, then rehearse with `--set commissioned={file}`"
-    made = f"run `shearloop commission CONFIG --out {file}`"
-    return f"{made}, then write `commissioned: {file}` into the configuration"
+        return f"run `shearloop commission CONFIG --out {file} --emulate`, then rehearse with {named}"
+    return f"run `shearloop commission CONFIG --out {file}`, then write {named} into the configuration"
 
 
 @dataclass(frozen=True, slots=True)

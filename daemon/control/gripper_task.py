@@ -21,6 +21,7 @@ from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
     GripperCommand,
+    GripperInactiveError,
     GripperState,
     GripperTooHotError,
     ObjectStatus,
@@ -71,14 +72,20 @@ class GripperTask:
                 self._take(state)
 
     async def grip(self, target: GripStep) -> None:
-        """Move to a width and wait for the end; raises DriverError and ActionError."""
+        """Move to a width and wait for the end; raises DriverError and ActionError.
+
+        A release activates the gripper where that is needed. A grip never does.
+        """
         with self._motion.commanded(self.clock.now_ns()):
-            if not isinstance(target, Opening):
-                await self._refuse_to_activate()
             try:
                 await self.gripper.activate(may_drop=isinstance(target, Opening))
             except GripperTooHotError as error:
                 raise NotBegunError(str(error)) from error
+            except GripperInactiveError as error:
+                raise NotBegunError(
+                    "the gripper is not active, as after a loss of power: its activation opens the fingers, and a tool "
+                    "that they may hold drops; secure the tool, then send `shearloop command release --yes`"
+                ) from error
             state, width_mm = await self.gripper.read(), target.width_mm
             if not isinstance(target, Opening):
                 self._refuse_to_open(target, state)
@@ -100,14 +107,6 @@ class GripperTask:
             closed = f"the fingers closed to {state.width_mm:.1f} mm and met nothing wider"
             thinner = "put the tool between them, or make `width_mm` some millimetres less than the tool"
             raise ActionError(f"{closed}; {thinner}")
-
-    async def _refuse_to_activate(self) -> None:
-        """Raise NotBegunError where an activation would come first, which opens the fingers, and a tool was gripped."""
-        if self.control_loop.tool.was_gripped and (await self.gripper.read()).activation is not ActivationStatus.ACTIVE:
-            raise NotBegunError(
-                "the gripper is not active any more, as after a loss of power: its activation opens the fingers, and "
-                "the gripped tool drops; put a `release` before it"
-            )
 
     def _is_open(self, target: Opening, state: GripperState) -> bool:
         """Return whether a release has nothing to do: it never closes the fingers."""

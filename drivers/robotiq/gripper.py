@@ -115,9 +115,10 @@ class RobotiqGripper:
     async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
         """Return the state of the active gripper; an inactive gripper opens and closes its fingers once.
 
-        After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
-        any state. A gripper that is too hot is activated only if a held object `may_drop`. Raises GripperFaultError if
-        the activation is refused or fails, GripperTooHotError if heat is the reason.
+        Its fingers may hold an object, which drops then: an inactive gripper, or one that is too hot, is activated only
+        if an object `may_drop`. After a major fault the operator has to confirm that the fingers are clear.
+        `operator_confirmed` activates in any state. Raises GripperFaultError if the activation is refused or fails:
+        GripperInactiveError or GripperTooHotError if the object is the reason.
         """
         readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)
@@ -128,8 +129,10 @@ class RobotiqGripper:
                 )
             if fault.too_hot and not may_drop:
                 raise messages.GripperTooHotError(fault.sentence)
-            if not blocking_fault(readout):
+            if not (blocking := blocking_fault(readout)):
                 return self._state(readout, t_ns)
+            if not may_drop:
+                raise messages.GripperInactiveError(blocking)
         await self._write(messages.GripperAction.RESET)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(

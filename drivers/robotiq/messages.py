@@ -22,6 +22,10 @@ class GripperTooHotError(GripperFaultError):
     """The gripper has to cool down; nothing was sent."""
 
 
+class GripperInactiveError(GripperFaultError):
+    """The gripper has to be activated, which opens and closes its fingers; nothing was sent."""
+
+
 class GripperRefusedError(DriverError):
     """A command that is invalid, or invalid now; nothing was sent."""
 

@@ -78,7 +78,8 @@ class ConnectedGripper(Opened):
 
     async def _activate(self, *, operator_confirmed: bool) -> None:
         async with halted_if_interrupted(self._gripper):
-            await self._gripper.activate(operator_confirmed=operator_confirmed)
+            # The operator is asked before each motion.
+            await self._gripper.activate(operator_confirmed=operator_confirmed, may_drop=True)
 
     async def _move(self, command: GripperCommand) -> GripperState:
         async with halted_if_interrupted(self._gripper):

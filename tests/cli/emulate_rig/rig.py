@@ -75,7 +75,7 @@ async def open_gripper_at(rig: RigProcess) -> AsyncIterator[RobotiqGripper]:
     gripper = RobotiqGripper(SocketClient(rig.host), WidthCalibration.nominal(), poll_s=0.02)
     try:
         await gripper.connect()
-        await gripper.activate()
+        await gripper.activate(may_drop=True)
         await release(gripper)
         yield gripper
     finally:

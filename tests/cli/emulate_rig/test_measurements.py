@@ -81,7 +81,7 @@ async def test_the_modbus_gripper_the_papers_sketch_a_sigma_and_the_truth_in_a_f
             load = await stack.enter_async_context(played.Reader(cell.readings()))
             right = await stack.enter_async_context(played.Reader(played.kit_at(rig, "right").readings()))
             await gripper.connect()
-            await gripper.activate()
+            await gripper.activate(may_drop=True)
             free = await played.mean_of(right)
             assert (await played.grip(gripper)).diameter_mm == pytest.approx(40.0, abs=1.0)
             await rig.fault("kick -0.06")

@@ -90,7 +90,7 @@ async def test_cancelled_grip_can_be_released(way, tmp_path):
 async def test_cancelled_grip_is_halted_and_stays_connected(way, tmp_path):
     async with reading(way, tmp_path) as (rig, task, felt):
         assert felt[-1].uncertain, "a gripper without power may hold a tool"
-        await rig.driver.activate()
+        await rig.driver.activate(may_drop=True)
         for turns in range(1, 40, 3):
             await task.release()
             assert not felt[-1].uncertain
@@ -134,16 +134,17 @@ async def test_halt_stops_the_fingers_after_a_reconnection(way, tmp_path):
 async def test_cancelled_activation_stops_the_fingers(way, tmp_path):
     async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
         task = task_of(rig)
-        grip = asyncio.create_task(task.grip(GRIP))
+        release = asyncio.create_task(task.release())
         while rig.model.width_mm < 100.0:  # noqa: ASYNC110 - the model is looked at, as it moves
             await asyncio.sleep(0)
-        grip.cancel()
+        release.cancel()
         await task.halt()
         rig.model.step(STEP_S)
         halted_mm = rig.model.width_mm
         for _ in range(200):
             await asyncio.sleep(0)
         assert rig.model.width_mm == halted_mm
+        await task.release()
         with pytest.raises(ActionError, match=r"closed to 0\.0 mm and met nothing wider; put the tool between them"):
             await task.grip(GRIP)
 
@@ -176,26 +177,44 @@ async def test_a_tool_as_wide_as_the_target_may_be_held_although_it_is_not_felt(
 
 
 @WAYS
-@pytest.mark.parametrize("gripped", [True, False])
-async def test_a_grip_does_not_activate_a_gripper_that_lost_its_power_with_a_tool(way, tmp_path, gripped):
-    """An activation opens the fingers, which may still hold the tool."""
+@pytest.mark.parametrize("object_mm", [None, 40.0, 134.0], ids=["nothing", "a tool", "nearly the stroke"])
+@pytest.mark.parametrize("gripped", [True, False], ids=["grip known", "grip unknown"])
+async def test_a_grip_does_not_activate_a_gripper_that_lost_its_power(way, tmp_path, gripped, object_mm):
+    """Its activation opens the fingers, and it cannot say whether they hold something. A confirmed release may."""
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
-        rig.model.object_mm = 40.0
+        rig.model.object_mm = object_mm
         felt = Felt()
         task = task_of(rig, felt)
-        await task.grip(GRIP)
+        await task.grip(GRIP.model_copy(update={"expect_object": object_mm is not None}))
         felt.tool.was_gripped = gripped
         held_mm = rig.model.width_mm
         rig.model.write(GripperRegisters())
         rig.model.step(STEP_S)
-        if not gripped:
-            await task.grip(GRIP)
-            return
-        with pytest.raises(NotBegunError, match="activation opens the fingers, and the gripped tool drops"):
+        with pytest.raises(NotBegunError, match=r"opens the fingers, and a tool .* `shearloop command release --yes`"):
             await task.grip(GRIP)
         assert (rig.model.width_mm, rig.model.sta) == (held_mm, 0)
-        await task.release()
+        await task.open_by_operator()
         assert rig.model.width_mm > 130.0
+        assert rig.model.sta == 3
+
+
+@WAYS
+async def test_a_grip_does_not_activate_a_gripper_that_loses_its_power_after_it_was_read(way, tmp_path, monkeypatch):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, held_mm = await holding(rig)
+        task.control_loop.tool.was_gripped = True
+        read = rig.driver.read
+
+        async def read_then_lost() -> GripperState:
+            state = await read()
+            rig.model.write(GripperRegisters())
+            rig.model.step(STEP_S)
+            return state
+
+        monkeypatch.setattr(rig.driver, "read", read_then_lost)
+        with pytest.raises(DriverError, match="has to be activated"):
+            await task.grip(replace_step(GRIP, force_n=100.0))
+        assert (rig.model.width_mm, rig.model.sta) == (held_mm, 0)
 
 
 @WAYS
@@ -326,7 +345,7 @@ async def test_a_hot_gripper_refuses_a_grip_and_opens_for_a_release(way, tmp_pat
 
 @WAYS
 async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_path):
-    async with a_rig(way, tmp_path, connected=True) as rig, asyncio.timeout(DEADLINE_S):
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         task, held_mm = await holding(rig)
         rig.driver.latest = None
         await task.unlock()
@@ -367,6 +386,7 @@ async def test_held_tool_has_a_diameter_while_states_are_new(tmp_path):
         task = task_of(rig)
         assert task.held_tool(0) is None, "nothing was read yet"
         await rig.driver.connect()
+        await task.release()
         await task.grip(GRIP)
         state = await rig.driver.read()
         tool = task.held_tool(state.t_ns)
@@ -391,7 +411,7 @@ async def test_fingers_move_from_a_command_to_its_end(tmp_path):
             return felt[-1].t_ns
 
         rig.model.object_mm = 40.0
-        await rig.driver.activate()
+        await rig.driver.activate(may_drop=True)
         for act in (lambda: task.grip(GRIP), task.release, task.open_by_operator):
             rested_ns = await next_state_ns()
             began_ns = await next_state_ns()

@@ -80,7 +80,7 @@ async def a_rig(
             if connected or active:
                 await driver.connect()
             if active:
-                await driver.activate()
+                await driver.activate(may_drop=True)
             yield rig
     finally:
         await driver.close()

@@ -21,7 +21,7 @@ async def test_gripper_activates_moves_and_measures_an_object(way, tmp_path):
         assert first.activation is messages.ActivationStatus.RESET
         with pytest.raises(messages.GripperFaultError, match="has to be activated"):
             await driver.move(messages.GripperCommand(50.0))
-        active = await driver.activate()
+        active = await driver.activate(may_drop=True)
         assert active.activation is messages.ActivationStatus.ACTIVE
         assert active.fault.code == 0
         # The fingers opened and closed for it.
@@ -190,7 +190,7 @@ async def test_major_fault_needs_the_operators_confirmation(way, tmp_path):
 async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
     """The operator has to confirm that the fingers are clear."""
     async with a_rig(way, tmp_path, connected=True) as rig:
-        activation = asyncio.create_task(rig.driver.activate())
+        activation = asyncio.create_task(rig.driver.activate(may_drop=True))
         while rig.model.sta != 1:  # noqa: ASYNC110 - the model is looked at, as it moves
             await asyncio.sleep(0)
         rig.model.fail(13)
@@ -219,6 +219,23 @@ async def test_a_gripper_that_is_too_hot_is_not_activated_and_drops_nothing(way,
         # Where the tool is to drop anyway, nothing keeps it.
         await rig.driver.activate(may_drop=True)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(140.0)))
+        assert rig.model.width_mm > 100
+
+
+@WAYS
+async def test_an_inactive_gripper_is_activated_only_where_an_object_may_drop(way, tmp_path):
+    """It cannot say whether it holds one."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        rig.model.object_mm = 40.0
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(5.0)))
+        held_mm = rig.model.width_mm
+        rig.model.write(GripperRegisters())
+        rig.model.step(STEP_S)
+        await rig.driver.read()
+        with pytest.raises(messages.GripperInactiveError, match="has to be activated"):
+            await rig.driver.activate()
+        assert (rig.model.width_mm, rig.model.sta) == (held_mm, 0)
+        await rig.driver.activate(may_drop=True)
         assert rig.model.width_mm > 100
 
 
@@ -256,7 +273,7 @@ async def test_command_of_another_master_is_seen_at_the_next_poll(way, tmp_path,
     """Position and object stay the same, but the target is no longer ours. A halted gripper tells of no object."""
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
-        await rig.driver.activate()
+        await rig.driver.activate(may_drop=True)
         rig.model.object_mm = 20.0
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
         rig.stopped = True

@@ -83,7 +83,7 @@ async def test_loss_during_a_command_is_reported(way, tmp_path):
         asyncio.timeout(20),
     ):
         await anext(states)
-        await rig.driver.activate()
+        await rig.driver.activate(may_drop=True)
         rig.silence(True)
         with pytest.raises(DeviceLostError) as met:
             await rig.driver.move(GripperCommand(50.0))
@@ -101,7 +101,7 @@ async def test_loss_during_a_command_is_reported(way, tmp_path):
 async def test_states_are_polled_while_a_command_runs(way, tmp_path):
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
-        activating = asyncio.create_task(rig.driver.activate())
+        activating = asyncio.create_task(rig.driver.activate(may_drop=True))
         seen = [await anext(states)]
         while not activating.done():
             seen.append(await anext(states))

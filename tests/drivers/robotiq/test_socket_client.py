@@ -160,7 +160,7 @@ async def test_no_state_of_a_slow_gripper_is_older_than_the_loop_accepts(monkeyp
 
         async def move() -> None:
             for width_mm in (20.0, 90.0):
-                await gripper.activate()
+                await gripper.activate(may_drop=True)
                 await gripper.finish(await gripper.move(GripperCommand(width_mm)))
 
         async with contextlib.aclosing(gripper.states()) as states:

@@ -39,10 +39,8 @@ def question_of(experiment: ReadExperiment, files: ExperimentFiles, loop: Contro
     if rests_on := tool_note(file, files.config, files.sources, files.robot):
         sentences = (*sentences, f"  {rests_on}")
     held = release_stakes(operator) if operator.tool.may_hold() else ()
-    dropping = operator.dropping_step(file)
-    drops = f"dropped in step {dropping[0]}" if dropping is not None else "not dropped"
     # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
-    digest = digest_of(experiment.data, text, *sentences, *occasion, drops, *held)
+    digest = digest_of(experiment.data, text, *sentences, *occasion, *held)
     # The width in this note wavers.
     return Question(text + held_note(operator, file), digest, sentences)
 

@@ -54,7 +54,7 @@ LONGEST = (
     "test_under_systemd.py", "test_set_clock.py", "test_load_delay.py", "test_server.py", "test_refused_exports.py",
     "test_flood.py", "test_pruned_matching.py", "test_skin_drift.py", "test_mad_client.py", "test_control_loop.py",
     "test_printable.py", "test_cli_recordings.py", "test_emulate.py", "test_skin_replay.py", "test_recorder.py",
-    "test_cylinders.py", "test_wrist_controller.py", "test_bank_design.py", "test_cli.py", "test_turns.py",
+    "test_no_drop_unasked.py", "test_cylinders.py", "test_wrist_controller.py", "test_bank_design.py", "test_cli.py", "test_turns.py",
     "test_skin_estimator.py", "test_line_clock.py", "test_design.py", "test_keys.py", "test_live_ways_out.py",
     "test_shared_recordings.py", "test_skin.py", "test_demo.py", "test_runner_any_order.py", "test_finite_strain.py",
     "test_leave_out.py", "test_adapt.py", "test_cli_reproduce.py", "test_plane_strain.py", "test_dead_channels.py",

@@ -79,10 +79,10 @@ def _capped_nm(file: ExperimentFile, turn: Turn, cap: MotionCap) -> float:
 def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
-    These are the first `hold_torque` on an unidentified tool, and a `tare` of a gripped one. No limit above the `cap`
-    is of use.
+    These are the first `hold_torque` on an unidentified tool, a `tare` of a gripped one, a torque that undoes a
+    `tighten`, and a `grip` wider than the one before it. No limit above the `cap` is of use.
     """
-    found: list[Mistake] = list(_undoing(file))
+    found: list[Mistake] = [*_undoing(file), *_opening(file)]
     identified = gripped = False
     for number, (step, turn) in enumerate(_with_turns(file)):
         found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, turn, cap)]
@@ -146,6 +146,23 @@ def _undoing(file: ExperimentFile) -> Iterator[Mistake]:
                         f"hold_torque turns {back} by the sign of its torque_nm, and undoes step {before}, "
                         f"tighten {direction}; write `direction: {direction}`, or `direction: {back}` if it is meant",
                     )
+
+
+def _opening(file: ExperimentFile) -> Iterator[Mistake]:
+    """Yield each `grip` that is wider than one before it: it would open the fingers, which only a `release` does."""
+    closed: tuple[int, float] | None = None
+    for number, step in enumerate(file.steps, 1):
+        if isinstance(step, ReleaseStep):
+            closed = None
+        elif isinstance(step, GripStep) and closed is not None and step.width_mm > closed[1]:
+            before, width_mm = closed
+            yield (
+                ("steps", number - 1),
+                f"grip to {step.width_mm:g} mm would open the fingers, which step {before} closes to {width_mm:g} mm; "
+                "put a `release` before it, or correct `width_mm`",
+            )
+        elif isinstance(step, GripStep):
+            closed = number, step.width_mm
 
 
 def check_devices(

@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
-from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile, GripStep, ReleaseStep, Step
+from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD
@@ -12,7 +12,7 @@ from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import (
     first_grip,
     first_motion_before_grip,
-    first_opening,
+    first_release,
     first_turn_before_tare,
 )
 from shearloop.daemon.torques import CONFIRM_TARE, SensorLoad, TorqueSource, load_of
@@ -22,6 +22,9 @@ CLAMPED_CURE = (
     "turn it back (a step `turn_to` needs no zero; if a limit stops it, at the pendant), or loosen its clamp; once "
     "nothing loads it, `shearloop command release --yes` lets its angle count from 0"
 )
+
+# A width that is asked for may be one count of the gripper, at most 0.7 mm, from the one that is reached.
+SAME_WIDTH_MM = 1.0
 
 
 def activation_sentence(what: str) -> str:
@@ -136,19 +139,12 @@ class OperatorView:
             return ""
         return f"the stop that waits is not the one that was shown: {stop.causes}"
 
-    def dropping_step(self, file: ExperimentFile) -> tuple[int, Step] | None:
-        """Return the first step that lets go of what the fingers hold now, or may hold, with its number; else None."""
-        if self.tool.any_object is None:
-            return None
-        width_mm = self.inputs.gripper.width_mm if self.inputs.gripper is not None else 0.0
-        return first_opening(file, width_mm, activates=self.tool.activates)
-
     def drop_sentence(self, file: ExperimentFile) -> str:
         """Return which step lets go of what the fingers hold now, or may hold; empty if none does."""
-        match self.dropping_step(file):
-            case (number, step):
-                return f"step {number} ({step.do}) opens the gripper, and a tool in it drops; {self.tool.any_object}"
-        return ""
+        number, what = first_release(file), self.tool.any_object
+        if number is None or what is None:
+            return ""
+        return f"step {number} (release) opens the gripper, and a tool in it drops; {what}"
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""
@@ -168,35 +164,37 @@ class OperatorView:
         return f"{why}; put a `grip` or a `release` before {motion}"
 
     def _why_no_activation(self, file: ExperimentFile) -> str | None:
-        """Return why a `grip` must not activate the gripper, or None: an activation would drop the held tool."""
-        first, held = first_grip(file), self.tool.gripped_tool
-        if first is None or not self.tool.activates or held is None:
+        """Return why a gripper that has to be activated refuses a `grip`, or None.
+
+        An activation opens the fingers, and a tool in them drops. Only a release activates.
+        """
+        first = first_grip(file)
+        if first is None or not self.tool.activates:
             return None
         number, _ = first
+        held = f"{what}; " if (what := self.tool.any_object) is not None else ""
         if self.inputs.gripper is not None and self.inputs.gripper.too_hot:
-            return f"{held}; the gripper is too hot for step {number} (grip): let it cool down"
+            return f"{held}the gripper is too hot for step {number} (grip): let it cool down"
         return (
-            f"{held}; step {number} (grip) would activate the gripper first, which opens its fingers, and the tool "
-            "drops: take it out with `shearloop command release --yes`, or put a `release` before it"
+            f"{held}step {number} (grip) needs an active gripper, and its activation opens the fingers, so that a tool "
+            "in them drops: take it out with `shearloop command release --yes`, or put a `release` before it"
         )
 
     def _why_no_grip(self, file: ExperimentFile) -> str | None:
-        """Return why a `grip` before any release would open the fingers on the held tool, or None.
+        """Return why a `grip` before any release would open the fingers on what they hold, or may hold, or None.
 
-        The gripper refuses it too, in the middle of the experiment: a grip never opens them on a tool.
+        The gripper's task refuses it too, in the middle of the experiment. A later grip is no wider than the first one.
         """
-        gripper, held = self.inputs.gripper, self.tool.held
-        if gripper is None or held is None:
+        gripper, first, held = self.inputs.gripper, first_grip(file), self.tool.any_object
+        if gripper is None or first is None or held is None:
             return None
-        for number, step in enumerate(file.steps, 1):
-            if isinstance(step, ReleaseStep):
-                return None
-            if isinstance(step, GripStep) and step.width_mm > gripper.width_mm:
-                return (
-                    f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a "
-                    "`release` before it, or correct `width_mm`"
-                )
-        return None
+        number, step = first
+        if step.width_mm <= gripper.width_mm + SAME_WIDTH_MM:
+            return None
+        return (
+            f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "
+            "it, or correct `width_mm`"
+        )
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""

@@ -9,7 +9,6 @@ from shearloop.daemon.control.experiment_schema import (
     GripperStep,
     GripStep,
     ReleaseStep,
-    Step,
     TareStep,
     TurnToStep,
     TwistingStep,
@@ -64,17 +63,9 @@ def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
     return None
 
 
-def first_opening(file: ExperimentFile, width_mm: float, *, activates: bool) -> tuple[int, Step] | None:
-    """Return the first step that may open fingers that are `width_mm` apart, with its number from 1, or None.
+def first_release(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that opens the fingers on whatever they hold, or None.
 
-    `activates`: the first step that moves them activates the gripper, which opens them.
+    A `grip` never does: the gripper's task refuses one that would open them on a tool, or activate the gripper.
     """
-    for number, step in enumerate(file.steps, 1):
-        if isinstance(step, GripStep):
-            if activates or step.width_mm > width_mm:
-                return number, step
-            # The fingers may close as far as that, on a thinner tool.
-            width_mm = step.width_mm
-        elif isinstance(step, ReleaseStep):
-            return number, step
-    return None
+    return next((n for n, step in enumerate(file.steps, 1) if isinstance(step, ReleaseStep)), None)

@@ -880,7 +880,8 @@ def test_a_grip_that_would_drop_the_held_tool_cannot_be_asked():
 
     wide = {**GRIP, "width_mm": 35.0}
     assert "step 1 (grip) to 35 mm would open them and drop it: put a `release` before" in refusal(wide)
-    assert "step 3 (grip) to 35 mm would open them and drop it" in refusal(GRIP, {"do": "wait", "wait_s": 1}, wide)
+    # The fingers may stand one count from the width that was asked for.
+    assert refusal({**GRIP, "width_mm": 30.5}) == ""
     assert refusal(GRIP) == refusal({"do": "release"}, wide) == refusal(GRIP, {"do": "release"}, wide) == ""
     assert "step 1 (tare): its fingers hold something" in refusal({"do": "tare"}, GRIP)
     assert refusal({"do": "release"}, {"do": "tare"}, GRIP) == ""

@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.commands import Commands
-from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
 from shearloop.daemon.control.experiment_check import check_steps
@@ -22,12 +21,11 @@ from shearloop.daemon.control.loop_runner import UNSEEN_S
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
-from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.stop_client import nothing_moved
-from shearloop.daemon.operator_questions import held_note, question_of, release_question
+from shearloop.daemon.operator_questions import held_note, release_question
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
@@ -562,7 +560,6 @@ def test_the_question_before_a_turn_says_what_is_held():
 
 
 OPENS = "(release) opens the gripper, and a tool in it drops; "
-OPENS_BY_GRIP = OPENS.replace("release", "grip")
 
 
 def grip_to(width_mm: float) -> dict[str, Any]:
@@ -576,16 +573,9 @@ def grip_to(width_mm: float) -> dict[str, Any]:
         ({}, [WAIT, {"do": "release"}], f"step 2 {OPENS}"),
         # The held tool is in the tighter grip too.
         ({}, [GRIP, TURN, {"do": "release"}], f"step 3 {OPENS}"),
-        (
-            {"uncertain": True},
-            [GRIP, {"do": "grip", "width_mm": 140.0}],
-            "step 2 (grip) opens the gripper, and a tool in it drops",
-        ),
         ({"uncertain": True}, [{"do": "release"}], f"step 1 {OPENS}the gripper does not know whether it holds a tool"),
-        ({"unfelt": True}, [{"do": "grip", "width_mm": 140.0}], "step 1 (grip) opens the gripper, and a tool in it"),
-        # Less wide than the fingers are at the start, and wider than the grip before.
-        ({"uncertain": True}, [grip_to(20.0), WAIT, grip_to(25.0)], f"step 3 {OPENS_BY_GRIP}"),
-        ({}, [grip_to(20.0), grip_to(15.0), grip_to(20.0)], f"step 3 {OPENS_BY_GRIP}"),
+        # The gripper's task refuses a grip that would open the fingers: no grip drops a tool.
+        ({}, [grip_to(20.0), grip_to(15.0), grip_to(20.0)], None),
         ({"uncertain": True}, [grip_to(20.0), WAIT, grip_to(20.0), grip_to(10.0)], None),
         ({"uncertain": True}, [GRIP, WAIT], None),
         ({}, [GRIP, TURN], None),
@@ -607,22 +597,46 @@ def test_no_start_lets_a_held_tool_go_without_a_confirmation(sense, steps, said)
     assert rig.control_loop.start(file, rig.t_ns, confirmed=True) is None
 
 
-def test_the_question_before_a_start_is_another_one_where_another_step_drops_the_tool(tmp_path):
-    """The fingers have closed since the question: another step opens them, which nobody has confirmed."""
-    rig = held(uncertain=True)
-    config = DaemonConfig.model_validate({"fingertips": {"right": {"device": {"path": "right"}}}})
-    files = ExperimentFiles((), config, rig.control_loop.sources, None, LoadedFiles(()))
-    file = ExperimentFile.model_validate({"name": "test", "steps": [grip_to(80.0), WAIT]})
-    read = ReadExperiment(tmp_path, file, b"the bytes of its file")
+@pytest.mark.parametrize("sense", [{}, {"uncertain": True}, {"unfelt": True}])
+def test_a_grip_that_would_open_the_fingers_on_what_they_may_hold_is_refused_at_the_start(sense):
+    """Also after a confirmation: the gripper's task refuses it in the middle of the experiment."""
+    rig = held(**sense)
+    rig.width_mm = 30.0
+    rig.run(0.1)
+    file = ExperimentFile.model_validate({"name": "test", "steps": [WAIT, grip_to(40.0)]})
+    for confirmed in (False, True):
+        refused = rig.control_loop.start(file, rig.t_ns, confirmed=confirmed)
+        assert "step 2 (grip) to 40 mm would open them and drop it: put a `release` before it" in refused
 
-    def digest_at(width_mm: float) -> str:
-        rig.width_mm = width_mm
-        rig.run(0.1)
-        return question_of(read, files, rig.control_loop).digest
 
-    at_100_mm = digest_at(100.0)
-    assert digest_at(99.0) == at_100_mm, "the width wavers"
-    assert digest_at(60.0) != at_100_mm
+@pytest.mark.parametrize("sense", [{"inactive": True}, {"inactive": True, "uncertain": True}, {"too_hot": True}])
+@pytest.mark.parametrize("holds", [False, True])
+def test_a_grip_that_needs_an_activation_is_refused_at_the_start(sense, holds):
+    rig = held(**sense)
+    rig.force_n = 60.0 if holds else 0.0
+    rig.run(0.1)
+    start = rig.control_loop.start
+    file, after_release = (
+        ExperimentFile.model_validate({"name": "test", "steps": [*first, GRIP]}) for first in ([], [{"do": "release"}])
+    )
+    assert "step 1 (grip)" in start(file, rig.t_ns, confirmed=True)
+    asked = start(after_release, rig.t_ns)
+    assert asked is None or asked.startswith(f"step 1 {OPENS}")
+
+
+@pytest.mark.parametrize(
+    ("widths_mm", "said"),
+    [
+        ((20.0, 15.0, 20.0), "grip to 20 mm would open the fingers, which step 2 closes to 15 mm; put a `release`"),
+        ((20.0, 15.0, 15.0), None),
+        ((20.0, None, 30.0), None),
+    ],
+)
+def test_a_grip_that_is_wider_than_the_one_before_is_refused_by_the_plan(widths_mm, said):
+    steps = [{"do": "release"} if width_mm is None else grip_to(width_mm) for width_mm in widths_mm]
+    mistakes = check_steps(ExperimentFile.model_validate({"name": "test", "steps": steps}))
+    assert [place for place, _ in mistakes] == ([("steps", 2)] if said else [])
+    assert said is None or mistakes[0][1].startswith(said)
 
 
 def test_a_start_with_empty_fingers_asks_nothing():

@@ -126,7 +126,7 @@ class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
     Each can run on the rig of `config`, with its torque `sources`, but the robot's, and its `robot`, if that is known.
-    None begins where a file of `loaded` has changed.
+    None begins where a file of `loaded` has changed: its check may be loaded with the first experiment.
     """
 
     folders: tuple[Path, ...]
@@ -254,7 +254,14 @@ class ExperimentFiles:
         known = {path.name: path for path in self._paths()}
         return "".join(f"; did you mean {known[name]}?" for name in get_close_matches(named.name, known, 1))
 
+    def _refuse_outdated(self) -> None:
+        """Raise UserError if a file has changed that the daemon has read, or a module that it may still load."""
+        if outdated := self.loaded.why_outdated():
+            raise UserError(outdated)
+
     def _read(self, named: Path) -> ReadExperiment:
+        # The check below may be loaded only now.
+        self._refuse_outdated()
         name = str(named) if len(str(named)) <= _LONGEST_NAME else shown(str(named))
         try:
             path = named.resolve()
@@ -287,8 +294,7 @@ class ExperimentFiles:
         if mistakes := document.located(self._mistakes(document)):
             structlog.get_logger().warning("the rig cannot run the experiment", mistakes="\n".join(mistakes))
             raise _mistaken(mistakes)
-        if outdated := self.loaded.why_outdated():
-            raise UserError(outdated)
+        self._refuse_outdated()
         return ReadExperiment(path, file, data)
 
 

@@ -1,7 +1,7 @@
 """The files that the daemon has read at its start, and whether they have changed since."""
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +10,17 @@ from shearloop.drivers.errors import system_reason
 
 # Of a larger file, such as a bank, only the time and the size tell that it has changed.
 _MAX_HASHED_BYTES = 32 << 20
+# The package, and its rooms that the daemon loads modules from.
+PACKAGE = Path(__file__).parents[1]
+_ROOMS = ("bank", "estimation", "drivers", "daemon")
+
+
+def code_of(package: Path) -> Iterator[Path]:
+    """Yield the modules that the daemon loads, also the ones that it loads with a later request."""
+    yield from package.glob("*.py")
+    for room in _ROOMS:
+        # The room may be a link, into which no search goes.
+        yield from (package / room).resolve().rglob("*.py")
 
 
 class _Stamp(NamedTuple):
@@ -34,9 +45,10 @@ class _Loaded(NamedTuple):
 
 
 class LoadedFiles:
-    """The configuration and the files that it names, as they were when the daemon began.
+    """The configuration, the files that it names, and the daemon's code, as they were when the daemon began.
 
-    The daemon reads them once. A limit that is lowered in one of them later does not hold until a restart.
+    The daemon reads them once. A limit that is lowered in one of them later does not hold until a restart. Of the code,
+    some modules are loaded with the first experiment: after an upgrade in place they would be of another version.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:
@@ -51,10 +63,10 @@ class LoadedFiles:
                 continue
 
     @classmethod
-    def of(cls, config: DaemonConfig) -> "LoadedFiles":
-        """Look at a configuration's own file and at all that it names, but the experiment."""
+    def of(cls, config: DaemonConfig, package: Path = PACKAGE) -> "LoadedFiles":
+        """Look at a configuration's own file, at all that it names but the experiment, and at the package's code."""
         named = [path for key, path in config.walk() if isinstance(path, Path) and key != "experiment"]
-        return cls([*named, *((config.file,) if config.file is not None else ())])
+        return cls([*named, *((config.file,) if config.file is not None else ()), *code_of(package)])
 
     def why_outdated(self) -> str:
         """Return which file has changed since the daemon's start; empty if none has. It reads the files that may have.

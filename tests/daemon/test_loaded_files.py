@@ -1,6 +1,8 @@
 """A daemon says that a file which it has read at its start has changed since."""
 
+import importlib
 import os
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ import yaml
 from shearloop.daemon import loaded_files
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.experiment_files import ExperimentFiles
-from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.loaded_files import PACKAGE, LoadedFiles, code_of
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
 
@@ -47,6 +49,38 @@ async def test_no_experiment_begins_once_a_file_of_the_rig_has_changed(rig, name
         await files.read(rig.parent / "one.yaml")
     changed.write_bytes(before)
     assert (await files.read(rig.parent / "one.yaml")).file.name == "one"
+
+
+@pytest.mark.parametrize("upgraded", ["faces.py", "daemon/control/experiment_check.py", "drivers/ur/arm.py"])
+async def test_no_experiment_begins_after_an_upgrade_in_place(rig, upgraded):
+    """The check, the plan and a new worker would be loaded of another version than the daemon."""
+    package = rig.parent / "package"
+    for module in ("faces.py", "daemon/control/experiment_check.py", "drivers/ur/arm.py", "tools/check.py"):
+        path = package / module
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("VERSION = 1\n")
+    config = load_daemon_config(rig)
+    sources = {name: TorqueSource(name=name, period_s=0.5) for name in ("right", "combined")}
+    loaded = LoadedFiles.of(config, package)
+    files = ExperimentFiles(config.experiment_folders, config, sources, None, loaded)
+    (package / "tools/check.py").write_text("VERSION = 2\n")
+    assert (await files.read(rig.parent / "one.yaml")).file.name == "one"
+    (package / upgraded).write_text("VERSION = 2\n")
+    with pytest.raises(UserError, match=f"^{package / upgraded} {OUTDATED}"):
+        await files.read(rig.parent / "one.yaml")
+    # Also before the file is checked, with which the first experiment loads the check.
+    (rig.parent / "one.yaml").write_text("name: one\n")
+    with pytest.raises(UserError, match=f"^{package / upgraded} {OUTDATED}"):
+        await files.read(rig.parent / "one.yaml")
+
+
+def test_the_code_has_every_module_that_a_daemon_has_loaded():
+    importlib.import_module("shearloop.daemon.operator_questions")
+    rooms = ("shearloop.bank", "shearloop.estimation", "shearloop.drivers", "shearloop.daemon")
+    modules = [module for name, module in sys.modules.items() if name.startswith(rooms)]
+    assert "shearloop.daemon.control.plan" in [module.__name__ for module in modules]
+    known = {path.resolve() for path in code_of(PACKAGE)}
+    assert [module for module in modules if Path(module.__file__ or "").resolve() not in known] == []
 
 
 def test_experiments_are_read_at_each_start_and_may_change(rig):

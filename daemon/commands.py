@@ -199,7 +199,8 @@ class Commands:
         return {}
 
     async def _unlock(self, request: Request) -> Reply:
-        from shearloop.daemon.operator_questions import release_stakes, unlock_question
+        # It is loaded with the rig.
+        from shearloop.daemon.control.operator_view import release_stakes, unlock_question
 
         rig = required_rig(self.rig)
         loop, confirmed = rig.control_loop, bool(request.get("confirmed"))
@@ -224,7 +225,7 @@ class Commands:
         return {}
 
     async def _release(self, request: Request) -> Reply:
-        from shearloop.daemon.operator_questions import release_question, release_stakes
+        from shearloop.daemon.control.operator_view import release_question, release_stakes
 
         rig = required_rig(self.rig)
         _refuse_if(rig.runner.release_refusal())

@@ -1,6 +1,6 @@
-"""The questions before a start, a release and an unlock: what moves, and what happens to a held tool.
+"""The question before a start: what moves, and what happens to a held tool.
 
-Nothing moves while a question is open, so its modules are loaded then.
+Nothing moves while the question is open, so its modules are loaded then.
 """
 
 from pathlib import Path
@@ -8,7 +8,7 @@ from pathlib import Path
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.known_tool import KnownTool, known_at_start
-from shearloop.daemon.control.operator_view import OperatorView, activation_sentence
+from shearloop.daemon.control.operator_view import OperatorView, clamped_turn, release_stakes
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.control.step_motions import first_grip, first_gripper_step, first_motion_before_grip
@@ -58,7 +58,7 @@ def held_note(operator: OperatorView, file: ExperimentFile) -> str:
     """Return a sentence on the held tool; empty if no step turns it or lets it go."""
     tool = operator.tool
     if not tool.has_gripper:
-        turned = _clamped_turn(operator)
+        turned = clamped_turn(operator)
         from_zero = "if another tool is clamped, `shearloop command release --yes` lets its angle count from 0"
         return f" At present the clamped tool's angle continues: {turned}; {from_zero}." if turned else ""
     drops, unknown = operator.drop_sentence(file), tool.unknown_grip
@@ -85,43 +85,3 @@ def file_refusal(operator: OperatorView, file: ExperimentFile) -> str | None:
 def start_of(operator: OperatorView) -> KnownTool:
     """Return the known angle and torque of the tool at a start."""
     return known_at_start(loaded=operator.tool.may_be_loaded(), twisted_rad=operator.tool.twisted_rad)
-
-
-def release_question(operator: OperatorView) -> str:
-    """Return what a release would do, for the operator who confirms it."""
-    if not operator.tool.has_gripper:
-        present = f"at present {turned}" if (turned := _clamped_turn(operator)) else "no angle counts at present"
-        from_zero = "the angle of the clamped tool counts from 0 at the next start"
-        return f"nothing opens, because no gripper is configured; {from_zero}; {present}"
-    gripper = operator.inputs.gripper
-    apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
-    what = operator.tool.held or f"the gripper reports no object, and {apart}"
-    renewed = "; it is activated first: the fingers open and close once" if operator.tool.activates else ""
-    return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
-
-
-def unlock_question(operator: OperatorView) -> str:
-    """Return what an unlock would drop, for the operator who confirms it; empty if it drops no tool."""
-    gripper = operator.inputs.gripper
-    if gripper is None or not gripper.fault or not operator.tool.may_hold():
-        return ""
-    may_hold = f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool"
-    return activation_sentence(operator.tool.held or may_hold)
-
-
-def release_stakes(operator: OperatorView) -> tuple[str, ...]:
-    """Return the facts that a confirmation of `release_question` covers; the width varies and is none of them."""
-    held = "held" if operator.tool.held is not None else "nothing held"
-    renewed = "renewed" if operator.tool.activates else "as it is"
-    # An exchanged tool shows as another request, or as another angle.
-    gripper, grip = operator.inputs.gripper, operator.tool.grip
-    requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
-    return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
-
-
-def _clamped_turn(operator: OperatorView) -> str:
-    """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""
-    arm, origin_rad = operator.inputs.arm, operator.tool.grip.origin_rad
-    if arm is None or origin_rad is None:
-        return ""
-    return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"

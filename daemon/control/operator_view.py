@@ -1,4 +1,8 @@
-"""The operator's commands: why each one is refused at present, and which question comes before it."""
+"""The operator's commands: why each one is refused at present, and which question comes before it.
+
+The questions before a release and an unlock are here, so that they are loaded with the rig: a way out must not depend
+on files that an upgrade in place has replaced.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -209,3 +213,43 @@ class OperatorView:
             "with the connection. Its torques and limits may be off by any load: "
             f"put {tare} before step {number} ({file.steps[number - 1].do}){command}"
         )
+
+
+def release_question(operator: OperatorView) -> str:
+    """Return what a release would do, for the operator who confirms it."""
+    if not operator.tool.has_gripper:
+        present = f"at present {turned}" if (turned := clamped_turn(operator)) else "no angle counts at present"
+        from_zero = "the angle of the clamped tool counts from 0 at the next start"
+        return f"nothing opens, because no gripper is configured; {from_zero}; {present}"
+    gripper = operator.inputs.gripper
+    apart = f"its fingers are {gripper.width_mm:.0f} mm apart" if gripper is not None else "its width is unknown"
+    what = operator.tool.held or f"the gripper reports no object, and {apart}"
+    renewed = "; it is activated first: the fingers open and close once" if operator.tool.activates else ""
+    return f"the gripper opens fully, and a tool in it drops; {what}{renewed}"
+
+
+def unlock_question(operator: OperatorView) -> str:
+    """Return what an unlock would drop, for the operator who confirms it; empty if it drops no tool."""
+    gripper = operator.inputs.gripper
+    if gripper is None or not gripper.fault or not operator.tool.may_hold():
+        return ""
+    may_hold = f"its fingers are {gripper.width_mm:.1f} mm apart, and may hold a tool"
+    return activation_sentence(operator.tool.held or may_hold)
+
+
+def release_stakes(operator: OperatorView) -> tuple[str, ...]:
+    """Return the facts that a confirmation of `release_question` covers; the width varies and is none of them."""
+    held = "held" if operator.tool.held is not None else "nothing held"
+    renewed = "renewed" if operator.tool.activates else "as it is"
+    # An exchanged tool shows as another request, or as another angle.
+    gripper, grip = operator.inputs.gripper, operator.tool.grip
+    requests = f"{gripper.requested_counts}, {gripper.others_requests} of others" if gripper is not None else "none"
+    return held, renewed, requests, f"{grip.force_n} N from {grip.origin_rad} rad"
+
+
+def clamped_turn(operator: OperatorView) -> str:
+    """Return how far a clamped tool is turned, as a sentence; empty if no angle counts."""
+    arm, origin_rad = operator.inputs.arm, operator.tool.grip.origin_rad
+    if arm is None or origin_rad is None:
+        return ""
+    return f"it is turned by {arm.wrist_rad - origin_rad:+.3f} rad"

@@ -285,7 +285,6 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
                     twisted_rad=0.0,
                     grip=NO_GRIP,
                 ),
-                dropping_step=lambda _: None,
                 drop_sentence=lambda _: "",
                 why_no_source=lambda _: None,
                 why_not_with_tool=lambda _: None,

@@ -15,11 +15,12 @@ from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentF
 from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus
+from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.torque_controller import ControllerReason
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.operator_questions import file_refusal, release_question
+from shearloop.daemon.operator_questions import file_refusal
 from shearloop.daemon.torques import TorqueSample, beyond_noise
 from tests.daemon.control.loop_rig import CONFIG, EIT, GRIP, LOAD, TICK_S, Rig, new_loop, phase, speed_of, started, stop
 

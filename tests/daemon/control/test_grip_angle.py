@@ -12,9 +12,10 @@ from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.grip import Grip
+from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.operator_questions import held_note, release_question, start_of
+from shearloop.daemon.operator_questions import held_note, start_of
 from shearloop.daemon.rig_memory import read_memories
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell

@@ -21,8 +21,9 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.grip import FOLLOWED_MM, NO_GRIP, SAME_WIDTH_MM, Grip
 from shearloop.daemon.control.inputs import GripperStatus
+from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.operator_questions import activation_note, release_question
+from shearloop.daemon.operator_questions import activation_note
 from shearloop.daemon.rig_memory import Remembered, RigMemory, read_memories, read_memory, write_memory
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.ur.client import UrRobot

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from benchmarks.call_counts import loaded_by_run
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase, TrackTorque
@@ -18,6 +20,7 @@ from shearloop.daemon.control.experiment_check import check_steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.loop_runner import UNSEEN_S
+from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.state_publisher import loop_state
 from shearloop.daemon.control.wrench import wrench_source
@@ -25,7 +28,7 @@ from shearloop.daemon.experiment_files import ReadExperiment
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.stop_client import nothing_moved
-from shearloop.daemon.operator_questions import held_note, release_question
+from shearloop.daemon.operator_questions import held_note
 from shearloop.daemon.rig import Rig as RigOfDaemon
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.running_rig import RunningRig
@@ -76,6 +79,24 @@ async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befal
             cell.control_loop.operator
         )
         assert await released(cell) is None
+        assert cell.gripper.asked == ["open"]
+
+
+async def test_a_way_out_loads_nothing_that_an_upgrade_in_place_has_replaced(monkeypatch):
+    with_the_rig = set(loaded_by_run(robot=True).modules)
+    for name in list(sys.modules):
+        if name.startswith("shearloop.") and name not in with_the_rig and not name.startswith("shearloop.emulators"):
+            # An import of it fails.
+            monkeypatch.setitem(sys.modules, name, None)
+    async with with_gripper() as cell:
+        commands = commands_of(cell)
+        cell.runner.stop(also_idle=True)
+        await cell.cycles(3)
+        assert await unlocked(cell, commands["unlock"]) == {}
+        asked = await commands["release"]({"ask": True})
+        answered = asyncio.create_task(commands["release"]({"confirmed": True, "digest": asked["digest"]}))
+        await cell.cycles(10)
+        assert await answered == {}
         assert cell.gripper.asked == ["open"]
 
 

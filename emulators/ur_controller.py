@@ -175,7 +175,7 @@ class Controller:
             writer.write(data)
 
     async def _serve_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        session = RtdeSession(self.robot, self._rate_hz, self.faults)
+        session = RtdeSession(self.robot, self._rate_hz, self.faults, self._rtde.values())
         self._rtde[writer] = session
         try:
             while data := await reader.read(4096):

@@ -2,7 +2,7 @@
 
 import re
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from shearloop.emulators.ur_arm import Vector
@@ -90,6 +90,8 @@ class RtdeSession:
     rate_hz: float
     # Names of faults; `refuse-protocol`, `registers-in-use` and `upper-registers-in-use` concern this connection.
     faults: set[str]
+    # Of all clients, as far as they are connected now; this one can be among them.
+    clients: Collection["RtdeSession"] = field(default=(), repr=False, compare=False)
     _buffer: bytearray = field(default_factory=bytearray)
     _inputs: list[list[str]] = field(default_factory=list)
     # Types by name.
@@ -118,6 +120,10 @@ class RtdeSession:
         self._due_s = max(self._due_s + self._period_s, self.robot.time_s)
         values = [variable(self.robot, name) for name in self._outputs]
         return package(DATA, b"\x01" + pack(self._outputs.values(), values))
+
+    def writes(self, name: str) -> bool:
+        """Return whether this client has an input of this name."""
+        return any(name in names for names in self._inputs)
 
     def _answer(self, kind: int, payload: bytes) -> bytes:
         if kind == DATA:
@@ -155,7 +161,9 @@ class RtdeSession:
         return package(INPUTS, bytes([len(self._inputs)]) + ",".join(kinds).encode())
 
     def _is_taken(self, name: str) -> bool:
-        """Return whether another client writes this input."""
+        """Return whether another client writes this input: an RTDE client, or by a fault a fieldbus."""
+        if any(client.writes(name) for client in self.clients if client is not self):
+            return True
         register = _REGISTER.fullmatch(name)
         upper = register is not None and int(register[3]) >= _REGISTERS // 2
         return register is not None and (

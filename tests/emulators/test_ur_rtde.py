@@ -87,6 +87,18 @@ def test_data_comes_at_the_rate_asked_for_and_not_before_the_start():
     assert packages == 126
 
 
+def test_inputs_of_another_client_are_in_use_until_it_leaves():
+    clients: list[RtdeSession] = []
+    one, other = (RtdeSession(Robot(), 500.0, set(), clients) for _ in range(2))
+    clients += [one, other]
+    names = b"input_int_register_24,input_double_register_24"
+    assert one.receive(package(ord("I"), names))[3:] == b"\x01INT32,DOUBLE"
+    assert one.receive(package(ord("I"), names))[3:] == b"\x02INT32,DOUBLE", "a client may have several recipes"
+    assert other.receive(package(ord("I"), b"input_int_register_24,input_int_register_0"))[3:] == b"\x00IN_USE,INT32"
+    clients.remove(one)
+    assert other.receive(package(ord("I"), names))[3:] == b"\x01INT32,DOUBLE"
+
+
 def test_registers_in_use_and_unknown_variables_are_refused_by_name():
     rtde = RtdeSession(Robot(), 500.0, {"registers-in-use"})
     ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))

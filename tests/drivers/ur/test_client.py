@@ -284,6 +284,19 @@ async def test_registers_of_the_upper_half_that_another_client_writes_are_left_t
         await turn(robot, controller, 0.1)
 
 
+async def test_an_unlock_beside_another_daemon_leaves_its_program_alone(controller):
+    """The second one takes the other half of the registers, and does not know the first one's stop."""
+    settings = settings_for(controller.host)
+    async with running(settings) as first:
+        await enable(first)
+        await controller.fault("protective-stop")
+        await until(first, lambda state: state.protective_stop and state.program_paused)
+        async with running(settings) as second:
+            await until(second, lambda state: not state.recovering)
+            assert "may be another daemon's" in (await second.send(Unlock())).refusal
+            assert (await second.next_state()).program_paused
+
+
 async def test_error_codes_of_the_controller_are_reported(controller, link):
     async with running(settings_for(controller.host), link) as robot:
         await enable(robot)

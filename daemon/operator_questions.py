@@ -3,11 +3,12 @@
 Nothing moves while the question is open, so its modules are loaded then.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
-from shearloop.daemon.control.known_tool import KnownTool, known_at_start
+from shearloop.daemon.control.known_tool import UNKNOWN
 from shearloop.daemon.control.operator_view import OperatorView, clamped_turn, release_stakes
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.sensor_reach import tool_note
@@ -32,15 +33,20 @@ def question_of(experiment: ReadExperiment, files: ExperimentFiles, loop: Contro
     """
     file, operator = experiment.file, loop.operator
     limits = files.robot.settings.limits if files.robot is not None else None
-    start, speeds = start_of(operator), files.config.loop
-    plan = plan_of(file, limits, files.config.gripper_model, warm_up_s=loop.warm_up_s, start=start, loop=speeds)
+    start, speeds, gripper = operator.known_tool(), files.config.loop, files.config.gripper_model
+    plan = plan_of(file, limits, gripper, warm_up_s=loop.warm_up_s, start=start, loop=speeds)
+    # The wrist's angle wavers: of it, nothing is confirmed.
+    start = replace(start, wrist_rad=UNKNOWN)
+    confirmed = plan_of(file, limits, gripper, warm_up_s=loop.warm_up_s, start=start, loop=speeds)
     motion, note = plan.first_motion, activation_note(operator, file)
     text, sentences = f"Start {file.name!r}? {motion[0].upper()}{motion[1:]}.{note}", tuple(plan.sentences())
-    if rests_on := tool_note(file, files.config, files.sources, files.robot):
+    rests_on = tool_note(file, files.config, files.sources, files.robot)
+    if rests_on:
         sentences = (*sentences, f"  {rests_on}")
     held = release_stakes(operator) if operator.tool.may_hold() else ()
     # The question depends on the gripper's state and on the tool in it, and the plan on the rig's limits.
-    digest = digest_of(experiment.data, text, *sentences, *occasion, *held)
+    said = (confirmed.first_motion, note, *confirmed.sentences(), rests_on)
+    digest = digest_of(experiment.data, *said, *occasion, *held)
     # The width in this note wavers.
     return Question(text + held_note(operator, file), digest, sentences)
 
@@ -80,8 +86,3 @@ def file_refusal(operator: OperatorView, file: ExperimentFile) -> str | None:
     if isinstance(file.steps[0], TareStep) and (reason := operator.why_no_tare_step()) is not None:
         return f"step 1 (tare): {reason}"
     return None
-
-
-def start_of(operator: OperatorView) -> KnownTool:
-    """Return the known angle and torque of the tool at a start."""
-    return known_at_start(loaded=operator.tool.may_be_loaded(), twisted_rad=operator.tool.twisted_rad)

@@ -292,7 +292,7 @@ class ControlLoop:
         if (reason := self.refusal_of(file, t_ns, confirmed=confirmed)) is not None:
             return reason
         driving, speeds = self.sources[file.torque_source], Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
-        self.experiment = Experiment(file, t_ns, speeds)
+        self.experiment = Experiment(file, t_ns, speeds, self.operator.known_tool())
         self._watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         self.stated_tool_mm = file.tool_mm
         self.wrist = self._wrists[file.torque_source]

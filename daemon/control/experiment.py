@@ -11,7 +11,7 @@ from typing import TypeAlias
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
-from shearloop.daemon.control.known_tool import TORQUE_TOLERANCE
+from shearloop.daemon.control.known_tool import AT_REST, TORQUE_TOLERANCE, KnownTool
 from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 from shearloop.daemon.torques import SIGNS
@@ -102,11 +102,11 @@ StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 class Experiment:
     """One run of an experiment file."""
 
-    def __init__(self, file: ExperimentFile, t_ns: int, speeds: Speeds = AS_ASKED) -> None:
-        """Begin at t_ns; `speeds` are the largest that the rig allows."""
+    def __init__(self, file: ExperimentFile, t_ns: int, speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST) -> None:
+        """Begin at t_ns; `speeds` are the largest that the rig allows, `start` is what is known of the tool."""
         self.file = file
         # The approximate duration of each step, for the remaining time shown to the operator.
-        self._expected_s = [one.takes_s for one in demands(file.steps, speeds)]
+        self._expected_s = [one.takes_s for one in demands(file, speeds, start)]
         self.phase = ExperimentPhase.RUNNING
         self.stop_reason = ""
         # The step's command, also while the wrist stands still.

@@ -110,10 +110,14 @@ class Held(Enum):
 
 @dataclass(frozen=True, slots=True)
 class KnownTool:
-    """The known state between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0."""
+    """The known state between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0.
+
+    `last_nm` is the torque that a step has asked for last in this grip, the likely one where it is not known.
+    """
 
     angle_rad: Interval = NONE
     torque_nm: Interval = NONE
+    last_nm: float = 0.0
     wrist_rad: Interval = UNKNOWN
     origin_rad: float | None = None
     held: Held = Held.MAYBE
@@ -147,7 +151,7 @@ class KnownTool:
         """Return the known state after a turn until the torque has a value, and while it was held."""
         turns = self.torque_nm.ways_to(torque_nm)
         creeps: Ways = frozenset({direction_of(torque_nm)})
-        return self._turned_beyond(turns | creeps, exactly(torque_nm))
+        return replace(self._turned_beyond(turns | creeps, exactly(torque_nm)), last_nm=torque_nm)
 
     def tightened(self, step: TightenStep, *, reaches: bool) -> "KnownTool":
         """Return the known state after a `tighten`; `reaches`: it ends near its torque or beyond, not at its angle."""
@@ -155,7 +159,8 @@ class KnownTool:
         until_nm = sign * (1.0 - TORQUE_TOLERANCE) * step.until_torque_nm
         torque_nm = exactly(until_nm).beyond(ways) if reaches else self._loaded(ways)
         by_rad = NONE.up_to(sign * step.until_angle_rad)
-        return self._turned(self.angle_rad.plus(by_rad), self.wrist_rad.plus(by_rad), torque_nm)
+        turned = self._turned(self.angle_rad.plus(by_rad), self.wrist_rad.plus(by_rad), torque_nm)
+        return replace(turned, last_nm=sign * step.until_torque_nm)
 
     def gripped(self, step: GripStep) -> "KnownTool":
         """Return the known state after the fingers have closed; a held tool is gripped tighter and keeps its angle."""
@@ -179,7 +184,7 @@ class KnownTool:
     def tared(self) -> "KnownTool":
         """Return the known state after a tare; it is refused with a held tool that is not clamped, or is turned."""
         angle_rad = self.angle_rad if self.held is Held.NO else self.angle_rad.within(UNTURNED_RAD)
-        return replace(self, angle_rad=angle_rad, torque_nm=NONE)
+        return replace(self, angle_rad=angle_rad, torque_nm=NONE, last_nm=0.0)
 
     def moved(self) -> "KnownTool":
         """Return the known state after a straight line, which may turn wrist 3 and load a held tool."""
@@ -217,13 +222,16 @@ AT_REST: Final = KnownTool()
 NOTHING_KNOWN: Final = KnownTool(angle_rad=UNKNOWN, torque_nm=UNKNOWN)
 
 
-def known_at_start(*, loaded: bool, twisted_rad: float) -> KnownTool:
-    """Return the known state at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip."""
+def known_at_start(*, loaded: bool, twisted_rad: float, wrist_rad: float | None = None) -> KnownTool:
+    """Return the known state at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip.
+
+    `wrist_rad` is where the wrist joint stands; None: it is not known.
+    """
+    stands_rad = UNKNOWN if wrist_rad is None else exactly(wrist_rad)
     if not loaded:
-        return AT_REST
-    if abs(twisted_rad) > UNTURNED_RAD:
-        return NOTHING_KNOWN
-    return replace(NOTHING_KNOWN, angle_rad=UNKNOWN.within(UNTURNED_RAD))
+        return replace(AT_REST, wrist_rad=stands_rad)
+    angle_rad = UNKNOWN if abs(twisted_rad) > UNTURNED_RAD else UNKNOWN.within(UNTURNED_RAD)
+    return replace(NOTHING_KNOWN, angle_rad=angle_rad, wrist_rad=stands_rad)
 
 
 def known_after(step: Step, known: KnownTool, *, reaches: bool = True) -> KnownTool:

@@ -11,7 +11,7 @@ from shearloop.daemon.control.experiment import Experiment
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
-from shearloop.daemon.control.known_tool import UNTURNED_RAD
+from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import (
     first_grip,
@@ -110,6 +110,12 @@ class OperatorView:
         # Of a sensor that is lost, the last torque says nothing of the present.
         uncounted.update(self.inputs.lost)
         return load_of(latest for name, latest in self.inputs.torques.items() if name not in uncounted)
+
+    def known_tool(self) -> KnownTool:
+        """Return the known angle and torque of the tool, and where the wrist stands, at a start."""
+        wrist_rad = self.inputs.arm.wrist_rad if self.inputs.arm is not None else None
+        loaded, twisted_rad = self.tool.may_be_loaded(), self.tool.twisted_rad
+        return known_at_start(loaded=loaded, twisted_rad=twisted_rad, wrist_rad=wrist_rad)
 
     def _turned(self) -> str:
         """Return how far a clamped tool is turned, which may load the sensors; empty where it is not.

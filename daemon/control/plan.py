@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool
-from shearloop.daemon.control.step_demands import Demand, demands
+from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
 from shearloop.daemon.control.turns import Turn, either_way, reversals, turns, ways_between
 from shearloop.daemon.loop_config import LoopConfig
@@ -23,8 +23,9 @@ FELT_MM = 5.0
 
 @dataclass(frozen=True, slots=True)
 class StepPlan:
-    """One step: its action in words, its largest values, and its limits, reversals and refusals.
+    """One step: its action in words, its times, its largest values, and its limits, reversals and refusals.
 
+    It takes about `duration_s`, and at most `longest_s`. `angle_rad` is its longest turn by a known angle, at most.
     `torque_nm` is None if the step turns the tool by an angle, because its torque is not known before. `reverses` says
     whether the step turns a held tool against the previous turn, `may_reverse` whether it may do so, `turns_back`
     whether it turns both ways, `way_unknown` whether it turns a tool in a direction that is not known before. `moves`
@@ -35,6 +36,7 @@ class StepPlan:
     do: str
     text: str
     duration_s: float
+    longest_s: float
     direction: str = ""
     torque_nm: float | None = 0.0
     angle_rad: float = 0.0
@@ -51,7 +53,7 @@ class StepPlan:
     def sentences(self) -> Iterator[str]:
         """Yield the step's lines."""
         timeout = f", stopped after {self.timeout_s:g} s" if self.timeout_s is not None else ""
-        yield f"  {self.number:>2}  {self.do:<12} {self.text}; about {_duration(self.duration_s)}{timeout}"
+        yield f"  {self.number:>2}  {self.do:<12} {self.text}; {_about(self.duration_s, self.longest_s)}{timeout}"
         for note in (*self.notes, *(f"REFUSED: {why}" for why in self.refused)):
             yield f"      {'':<12} {note}"
 
@@ -74,8 +76,13 @@ class Plan:
         return sum(step.duration_s for step in self.steps)
 
     @property
+    def longest_s(self) -> float:
+        """How long all steps may take."""
+        return sum(step.longest_s for step in self.steps)
+
+    @property
     def angle_rad(self) -> float:
-        """The largest angle of a step."""
+        """The longest turn of a step that asks for an angle."""
         return max(step.angle_rad for step in self.steps)
 
     @property
@@ -107,21 +114,22 @@ class Plan:
 
     def as_json(self) -> dict[str, Any]:
         """Return the plan for a script."""
-        names = ("duration_s", "angle_rad", "torque_nm", "torque_is_known", "force_n")
+        names = ("duration_s", "longest_s", "angle_rad", "torque_nm", "torque_is_known", "force_n")
         totals = {name: getattr(self, name) for name in names}
         return asdict(self) | totals
 
     def sentences(self) -> Iterator[str]:
         """Yield the plan's lines."""
-        yield f"plan of {self.name!r}, driven by {self.torque_source}, about {_duration(self.duration_s)}:"
+        yield f"plan of {self.name!r}, driven by {self.torque_source}, {_about(self.duration_s, self.longest_s)}:"
         for step in self.steps:
             yield from step.sentences()
         torque = f"{self.torque_nm:g} N·m" if self.torque_nm is not None else ""
         if not self.torque_is_known:
             torque += " where a torque is asked for, and " if torque else ""
             torque += "a torque not known before where the tool turns by an angle"
+        asked = " that asks for an angle" if any(step.do == "hold_torque" for step in self.steps) else ""
         yield (
-            f"  at most {_angle(self.angle_rad)} in a step, {torque}, fingers "
+            f"  at most {_angle(self.angle_rad)} in a turn{asked}, {torque}, fingers "
             f"{self.force_n:g} N; its limits stop it at {self.limit_nm:g} N·m and {_angle(self.limit_rad)} from "
             "the grip"
         )
@@ -179,16 +187,16 @@ def plan_of(
     refused_tares = _tares_before_release(file) if gripper is not None else frozenset()
     untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
     planned: list[StepPlan] = []
-    expected = zip(file.steps, found_turns, demands(file.steps, speeds, known), strict=True)
+    expected = zip(file.steps, found_turns, demands(file, speeds, known, robot), strict=True)
     for number, (step, turn, needs) in enumerate(expected, 1):
-        duration_s = needs.takes_s
+        waits_s = 0.0
         notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot, speeds)]
         if number in waits:
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {waits[number]}")
-            duration_s += warm_up_s
-        if needs.begins_anywhere:
-            notes.append("how long it takes depends on where the arm stands, and is a guess here")
-        if step.timeout_s is not None and needs.takes_s > step.timeout_s:
+            waits_s = warm_up_s
+        if needs.depends_on:
+            notes.append(f"how long it takes depends on {needs.depends_on}, and is a guess here")
+        if step.timeout_s is not None and needs.longest_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:
             notes.append("no `tare` comes before it: the start is refused unless a zero is known")
@@ -199,10 +207,11 @@ def plan_of(
                 number=number,
                 do=step.do,
                 text=_words(step, turn, gripper, speeds),
-                duration_s=duration_s,
+                duration_s=needs.takes_s + waits_s,
+                longest_s=needs.longest_s + waits_s,
                 direction=turn.direction or "",
                 torque_nm=None if turn.by_angle else needs.torque_nm,
-                angle_rad=_largest_angle(step, needs),
+                angle_rad=needs.turn_rad,
                 force_n=step.force_n if isinstance(step, steps.GripStep) else 0.0,
                 timeout_s=step.timeout_s,
                 reverses=number in ways.back,
@@ -426,17 +435,14 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None,
                 yield f"it asks for {step.speed_rad_per_s:g} rad/s, and {limit} allows {largest_rad_per_s:g} rad/s"
 
 
-def _largest_angle(step: Step, needs: Demand) -> float:
-    match step:
-        case steps.TwistStep():
-            return max(map(abs, step.angles_rad))
-        case steps.TurnToStep():
-            return abs(step.angle_rad)
-    return needs.angle_rad
-
-
 def _angle(angle_rad: float) -> str:
-    return f"{angle_rad:g} rad ({math.degrees(angle_rad):.0f}°)"
+    return f"{round(angle_rad, 3):g} rad ({math.degrees(angle_rad):.0f}°)"
+
+
+def _about(seconds: float, longest_s: float) -> str:
+    """Return in words how long something takes, and how long it may take."""
+    about, longest = _duration(seconds), _duration(longest_s)
+    return f"about {about}" if longest == about else f"about {about}, at most {longest}"
 
 
 def _duration(seconds: float) -> str:

@@ -1,13 +1,14 @@
 """What each step demands: its largest torque and angle, and its times."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Final, NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
+    ExperimentFile,
     GripStep,
     HoldTorqueStep,
     IdentifyStep,
@@ -19,28 +20,42 @@ from shearloop.daemon.control.experiment_schema import (
     TwistStep,
     WaitStep,
 )
-from shearloop.daemon.control.known_tool import AT_REST, KnownTool, known_after
+from shearloop.daemon.control.known_tool import AT_REST, Interval, KnownTool, known_after
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
+from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, along_tool, turn_between
+from shearloop.drivers.ur.settings import UrLimits
+
+# The largest UR arm reaches as far.
+_REACH_M: Final = 1.75
+# How far a turn to an angle of the wrist joint goes, as a guess: without a tool, and as a twist.
+_GUESSED_TURN_RAD, _GUESSED_TWIST_RAD = 1.0, 0.2
 
 
 class Demand(NamedTuple):
-    """The largest torque (N·m) and angle from the grip (rad) of a step, and its times.
+    """The largest torque (N·m) and angle from the grip (rad) of a step, its longest turn (rad), and its times.
 
-    It stands still for `stands_s` in all, and takes about `moves_s` for everything else. `begins_anywhere`: it moves to
-    a pose from one that is not known before, so that `moves_s` is a guess.
+    It stands still for `stands_s` in all, and takes about `moves_s` for everything else, at most `longest_moves_s`.
+    `depends_on` is the unknown state from which it begins: its `moves_s` is a guess then. `turn_rad` is a bound then.
     """
 
     torque_nm: float = 0.0
     angle_rad: float = 0.0
     stands_s: float = 0.0
     moves_s: float = 0.0
-    begins_anywhere: bool = False
+    longest_moves_s: float = 0.0
+    turn_rad: float = 0.0
+    depends_on: str = ""
 
     @property
     def takes_s(self) -> float:
         """About how long the step takes."""
         return self.stands_s + self.moves_s
+
+    @property
+    def longest_s(self) -> float:
+        """How long the step may take."""
+        return self.stands_s + max(self.moves_s, self.longest_moves_s)
 
 
 # The wrist slows down as it comes near an angle or a torque. At the default bandwidth this adds 0.3 s to a turn at
@@ -48,27 +63,29 @@ class Demand(NamedTuple):
 SETTLES_S: Final = 0.5
 
 
-def _travel_rad(angles_rad: Sequence[float]) -> float:
-    """Return how far the wrist turns from angle to angle."""
-    return sum(abs(later - earlier) for earlier, later in pairwise(angles_rad))
-
-
 class Before(NamedTuple):
-    """The known state of the tool before a step, and the tool's pose; None for an unknown one."""
+    """The known state before a step: the tool, and its pose, None for an unknown one; and what bounds the unknown."""
 
     tool: KnownTool = AT_REST
     pose_m_rad: Sequence[float] | None = None
+    limit_nm: float = math.inf
+    limit_rad: float = math.inf
+    robot: UrLimits | None = None
 
 
 NOTHING_BEFORE: Final = Before()
 
 
-def demands(planned: Iterable[Step], speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST) -> Iterator[Demand]:
+def demands(
+    file: ExperimentFile, speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST, robot: UrLimits | None = None
+) -> Iterator[Demand]:
     """Yield the demand of each step after those before it."""
-    before = Before(start)
-    for step in planned:
-        yield demand(step, speeds, before)
-        before = Before(known_after(step, before.tool), _pose_after(step, before.pose_m_rad))
+    tool, pose_m_rad = start, None
+    for step in file.steps:
+        limits = file.limits_of(step)
+        yield demand(step, speeds, Before(tool, pose_m_rad, limits.torque_nm, limits.angle_rad, robot))
+        # A `tighten` may end at its angle, without its torque.
+        tool, pose_m_rad = known_after(step, tool, reaches=False), _pose_after(step, pose_m_rad)
 
 
 def _pose_after(step: Step, pose_m_rad: Sequence[float] | None) -> Sequence[float] | None:
@@ -95,62 +112,123 @@ def _line_s(step: ApproachStep, start: Sequence[float], end: Sequence[float], sp
     return max(way_m / speed, turn_rad / speeds.wrist_rad_per_s)
 
 
+def _farthest_line_s(step: ApproachStep, pose: Sequence[float], speeds: Speeds, robot: UrLimits | None) -> float:
+    """Return the time of the longest straight move to a pose: across the workspace, or the reach of the largest arm."""
+    farthest_m = math.hypot(*pose[:3]) + _REACH_M
+    if robot is not None:
+        box = robot.box
+        farthest_m = math.hypot(
+            *(max(abs(at - low), abs(high - at)) for at, low, high in zip(pose, box.lower_m, box.upper_m, strict=False))
+        )
+    return max(farthest_m / min(step.speed_m_per_s, speeds.linear_m_per_s), math.pi / speeds.wrist_rad_per_s)
+
+
 def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFORE) -> Demand:
     """Return the demand of a step; unknown values, as in an outline, are 0."""
     match step:
         case HoldTorqueStep(torque_nm=torque_nm):
-            # An unknown torque counts as none.
-            ramped_nm = abs(step.signed_torque_nm - (before.tool.torque_nm.exact or 0.0))
-            moves_s = ramped_nm / step.ramp_nm_per_s + (SETTLES_S if ramped_nm else 0.0)
-            return Demand(abs(torque_nm), stands_s=step.hold_s, moves_s=moves_s)
+            return _from_start(Demand(abs(torque_nm), stands_s=step.hold_s), step, speeds, before)
         case TightenStep(until_torque_nm=torque_nm, until_angle_rad=angle_rad):
-            speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
-            return Demand(torque_nm, angle_rad, moves_s=angle_rad / speed_rad_per_s)
+            longest_s = SETTLES_S + angle_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
+            # At which angle it reaches its torque depends on the tool's stiffness.
+            return Demand(torque_nm, angle_rad, 0.0, 0.5 * longest_s, longest_s, angle_rad)
         case IdentifyStep(amplitude_rad=angle_rad, hold_s=hold_s):
             # Two cycles at least, to half of the angle and to all of it; the first of five rests is twice as long.
             moves_s = 3.0 * angle_rad / speeds.wrist_rad_per_s + 5.0 * SETTLES_S
-            return Demand(angle_rad=angle_rad, stands_s=6.0 * hold_s, moves_s=moves_s)
+            # Up to eight cycles: 17 rests, of which twelve are longer by 0.5 periods of a torque on average.
+            longer_s = 12.0 * (angle_rad / speeds.wrist_rad_per_s + hold_s + SETTLES_S) + 4.0
+            return Demand(0.0, angle_rad, 6.0 * hold_s, moves_s, moves_s + longer_s, angle_rad)
         case TwistStep(angles_rad=angles_rad):
-            return _twist_demand(step, angles_rad, speeds, before.tool)
+            most_rad = 0.0 if step.absolute else max(map(abs, angles_rad))
+            stands_s = step.hold_s * len(angles_rad) * step.repeats
+            return _from_start(Demand(0.0, most_rad, stands_s), step, speeds, before)
+        case TurnToStep(angle_rad=_):
+            return _from_start(Demand(), step, speeds, before)
         case WaitStep(wait_s=wait_s):
             return Demand(stands_s=wait_s)
         case TareStep():
             return Demand(moves_s=6.0)
         case ApproachStep(along_tool_m=float() as distance_m):
             return Demand(moves_s=1.0 + abs(distance_m) / min(step.speed_m_per_s, speeds.linear_m_per_s))
-        case TurnToStep(angle_rad=angle_rad):
-            # Where the wrist is, is known only there.
-            wrist_rad = before.tool.wrist_rad.exact
-            travel_rad = 1.0 if wrist_rad is None else abs(angle_rad - wrist_rad)
-            return Demand(moves_s=SETTLES_S + travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s))
         case ApproachStep(pose_m_rad=tuple() as pose) if before.pose_m_rad is not None:
             return Demand(moves_s=1.0 + _line_s(step, before.pose_m_rad, pose, speeds))
-        case ApproachStep():
-            return Demand(moves_s=3.0, begins_anywhere=True)
-        case GripStep() | ReleaseStep() | AdaptStep():
+        case ApproachStep(pose_m_rad=tuple() as pose):
+            longest_s = 1.0 + _farthest_line_s(step, pose, speeds, before.robot)
+            return Demand(moves_s=min(3.0, longest_s), longest_moves_s=longest_s, depends_on="where the arm stands")
+        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
             return Demand()
 
 
-def _twist_demand(step: TwistStep, angles_rad: Sequence[float], speeds: Speeds, tool: KnownTool) -> Demand:
-    stands_s = step.hold_s * len(angles_rad) * step.repeats
-    if step.absolute:
-        # How far an absolute angle is from the grip is known only there, unless the wrist was turned to one.
-        start_rad = tool.wrist_rad.exact
-        reach = [0.2 if start_rad is None else abs(one - start_rad) for one in angles_rad]
-    else:
-        # An unknown angle counts as that of the grip.
-        start_rad = tool.angle_rad.exact
-        reach = [abs(one - (start_rad or 0.0)) for one in angles_rad]
-    moves = step.repeats * len(angles_rad)
-    if step.return_to_start:
-        moves, travel_rad = 2 * moves, step.repeats * 2.0 * sum(reach)
-    else:
-        # Each round begins at the last angle of the one before.
-        between_rounds_rad = abs(angles_rad[0] - angles_rad[-1])
-        travel_rad = reach[0] + step.repeats * _travel_rad(angles_rad)
-        travel_rad += (step.repeats - 1) * between_rounds_rad
-    moves_s = travel_rad / min(step.speed_rad_per_s, speeds.wrist_rad_per_s) + SETTLES_S * moves
-    most_rad = 0.0 if step.absolute else max(abs(angle_rad) for angle_rad in angles_rad)
-    return Demand(0.0, most_rad, stands_s, moves_s)
+class _Start(NamedTuple):
+    """From where a step begins: the possible values of an angle or a torque, the likely one, and its name in words."""
+
+    bounds: Interval
+    likely: float
+    name: str
+
+
+def _from_start(needs: Demand, step: HoldTorqueStep | TurnToStep | TwistStep, speeds: Speeds, before: Before) -> Demand:
+    """Return a step's demand with its times, which depend on the value from which it begins."""
+    start = _start_of(step, before)
+    moves_s, turn_rad = _moves(step, start.likely, speeds)
+    if start.bounds.exact is not None:
+        return needs._replace(moves_s=moves_s, longest_moves_s=moves_s, turn_rad=turn_rad)
+    # Every distance is convex in its start, so that the longest one is from an end.
+    from_ends = [_moves(step, end, speeds) for end in start.bounds]
+    longest_s, longest_rad = (max(values) for values in zip(*from_ends, strict=True))
+    return needs._replace(moves_s=moves_s, longest_moves_s=longest_s, turn_rad=longest_rad, depends_on=start.name)
+
+
+def _start_of(step: HoldTorqueStep | TurnToStep | TwistStep, before: Before) -> _Start:
+    tool, limit_rad, robot = before.tool, before.limit_rad, before.robot
+    name = "where wrist 3 stands"
+    farthest_rad = LARGEST_ANGLE_RAD
+    if robot is not None:
+        farthest_rad = max(-robot.joints.lower_rad[-1], robot.joints.upper_rad[-1])
+    match step:
+        case HoldTorqueStep():
+            bounds, likely, name = tool.torque_nm.within(before.limit_nm), tool.last_nm, "the torque before it"
+        case TurnToStep(angle_rad=angle_rad):
+            bounds, likely = tool.wrist_rad.within(farthest_rad), angle_rad - _GUESSED_TURN_RAD
+        case TwistStep(angles_rad=angles_rad, absolute=True):
+            # All of its angles are within the limit from the grip, and so is the angle from which it begins.
+            turned = tool.angle_rad.within(limit_rad)
+            near = Interval(max(angles_rad) - limit_rad + turned.low, min(angles_rad) + limit_rad + turned.high)
+            bounds = tool.wrist_rad
+            if bounds.exact is None:
+                bounds = Interval(max(bounds.low, near.low), min(bounds.high, near.high))
+            likely = angles_rad[0] - _GUESSED_TWIST_RAD
+        case TwistStep():
+            bounds, likely, name = tool.angle_rad.within(limit_rad), 0.0, "the tool's angle before it"
+    return _Start(bounds, min(max(likely, bounds.low), bounds.high), name)
+
+
+def _moves(step: HoldTorqueStep | TurnToStep | TwistStep, start: float, speeds: Speeds) -> tuple[float, float]:
+    """Return how long a step moves from a torque or an angle, and its longest turn; 0 where that is not known."""
+    repeats = 1
+    match step:
+        case HoldTorqueStep():
+            ramped_nm = abs(step.signed_torque_nm - start)
+            return ramped_nm / step.ramp_nm_per_s + (SETTLES_S if ramped_nm else 0.0), 0.0
+        case TurnToStep(angle_rad=angle_rad):
+            angles_rad = [start, angle_rad]
+        case TwistStep(return_to_start=True, repeats=repeats):
+            angles_rad = [start, *(turned_to for angle_rad in step.angles_rad for turned_to in (angle_rad, start))]
+        case TwistStep(repeats=repeats):
+            angles_rad = [start, *step.angles_rad]
+    turns_rad = _turns(angles_rad)
+    travel_rad, longest_rad = sum(turns_rad), max(turns_rad)
+    if repeats > 1:
+        # Each later round begins at the last angle of the one before.
+        again_rad = _turns([angles_rad[-1], *angles_rad[1:]])
+        travel_rad += (repeats - 1) * sum(again_rad)
+        longest_rad = max(longest_rad, *again_rad)
+    speed_rad_per_s = min(step.speed_rad_per_s, speeds.wrist_rad_per_s)
+    return travel_rad / speed_rad_per_s + SETTLES_S * len(turns_rad) * repeats, longest_rad
+
+
+def _turns(angles_rad: Sequence[float]) -> list[float]:
+    """Return how far the wrist turns from angle to angle."""
+    return [abs(later - earlier) for earlier, later in pairwise(angles_rad)]

@@ -18,6 +18,7 @@ from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.experiment_schema import MAX_ANGLES_IN_ALL, MAX_STEPS
 from shearloop.daemon.control.grip import NO_GRIP, Grip
+from shearloop.daemon.control.known_tool import AT_REST
 from shearloop.daemon.errors import InvalidExperimentError
 from shearloop.daemon.experiment_files import ExperimentFiles
 from shearloop.daemon.loaded_files import LoadedFiles
@@ -276,15 +277,9 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
             operator=SimpleNamespace(
                 inputs=SimpleNamespace(gripper=None),
                 tool=SimpleNamespace(
-                    has_gripper=True,
-                    may_hold=lambda: False,
-                    may_be_loaded=lambda: False,
-                    activates=False,
-                    held=None,
-                    unknown_grip="",
-                    twisted_rad=0.0,
-                    grip=NO_GRIP,
+                    has_gripper=True, may_hold=lambda: False, activates=False, held=None, unknown_grip="", grip=NO_GRIP
                 ),
+                known_tool=lambda: AT_REST,
                 drop_sentence=lambda _: "",
                 why_no_source=lambda _: None,
                 why_not_with_tool=lambda _: None,

@@ -15,7 +15,7 @@ from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
-from shearloop.daemon.operator_questions import held_note, start_of
+from shearloop.daemon.operator_questions import held_note
 from shearloop.daemon.rig_memory import read_memories
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
@@ -366,8 +366,8 @@ def test_the_plan_before_a_start_assumes_nothing_of_a_tool_that_is_turned(rig):
     ready = rig()
     file = ExperimentFile.model_validate({"name": "one", "steps": [{"do": "twist", "angles_rad": [0.1]}]})
     if rig is clamped_rig:
-        before = plan_of(file, start=start_of(ready.control_loop.operator))
+        before = plan_of(file, start=ready.control_loop.operator.known_tool())
         assert (before.steps[0].direction, before.assumed) == ("counterclockwise", "")
         started(ready, TWIST_AGAIN, **TWISTED).run(20)
-    plan = plan_of(file, start=start_of(ready.control_loop.operator))
+    plan = plan_of(file, start=ready.control_loop.operator.known_tool())
     assert (plan.steps[0].way_unknown, plan.steps[0].direction, plan.assumed) == (True, "", "")

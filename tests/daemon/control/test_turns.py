@@ -19,7 +19,7 @@ from shearloop.daemon.torques import BOTH_DIRECTIONS, SIGNS, direction_of
 _SMALL = 1e-9
 
 
-class _EndedError(Exception):
+class EndedError(Exception):
     """The daemon stops the experiment here, or refuses it."""
 
 
@@ -78,7 +78,7 @@ class Run:
                 self._tighten(step)
             case steps.IdentifyStep():
                 if abs(self.torque) + self.stiffness * step.amplitude_rad > self.slips_at:
-                    raise _EndedError
+                    raise EndedError
                 start = self.angle
                 self.turn(start + step.amplitude_rad)
                 self.turn(start)
@@ -87,7 +87,7 @@ class Run:
                 self.rest()
             case steps.TareStep():
                 if (self.held and not self.clamped) or abs(self.angle) > UNTURNED_RAD:
-                    raise _EndedError
+                    raise EndedError
                 self.torque = 0.0
             case steps.ApproachStep():
                 self.angle += self.rng.uniform(-1.0, 1.0)
@@ -118,7 +118,7 @@ class Run:
 
     def _hold(self, torque: float) -> None:
         if not self.held or abs(torque) >= self.slips_at:
-            raise _EndedError
+            raise EndedError
         by = (torque - self.torque) / self.stiffness
         if abs(by) > _SMALL:
             self.moves.append(by)
@@ -135,7 +135,7 @@ class Run:
         while sign * self.torque < until:
             if abs(self.angle - start) >= step.until_angle_rad - _SMALL:
                 if self.reaches:
-                    raise _EndedError
+                    raise EndedError
                 return
             self.turn(self.angle + sign * min(0.01, step.until_angle_rad - abs(self.angle - start)))
         if self.moves and self.slips_at == math.inf:
@@ -179,11 +179,11 @@ _TURNING = (
     _step("approach", along_tool_m=st.just(0.01)),
 )
 _TARE, _GRIP, _RELEASE = {"do": "tare"}, {"do": "grip"}, {"do": "release"}
-_CLAMPED = st.lists(st.one_of(*_TURNING, st.just(_TARE)), min_size=1, max_size=6)
-_GRIPPED = st.lists(st.one_of(*_TURNING, *_TURNING, st.just(_GRIP), st.just(_RELEASE)), min_size=1, max_size=6)
+CLAMPED = st.lists(st.one_of(*_TURNING, st.just(_TARE)), min_size=1, max_size=6)
+GRIPPED = st.lists(st.one_of(*_TURNING, *_TURNING, st.just(_GRIP), st.just(_RELEASE)), min_size=1, max_size=6)
 
 
-def _file(content: list[dict[str, Any]]) -> ExperimentFile:
+def file_of(content: list[dict[str, Any]]) -> ExperimentFile:
     return ExperimentFile.model_validate(
         {"name": "one", "limits": {"torque_nm": 0.5, "angle_rad": 5}, "steps": content}
     )
@@ -203,7 +203,7 @@ def _holds_in(file: ExperimentFile, run: Run) -> None:
         was_held = run.held
         try:
             run.do(step)
-        except _EndedError:
+        except EndedError:
             return
         turned = ways(run)
         first = turned[0] if turned else None
@@ -225,28 +225,28 @@ def _holds_in(file: ExperimentFile, run: Run) -> None:
             last = None
 
 
-@given(content=_CLAMPED, seed=st.integers(0, 2**32))
+@given(content=CLAMPED, seed=st.integers(0, 2**32))
 @settings(max_examples=400, deadline=None)
 def test_what_the_plan_says_of_a_clamped_tool_holds_in_every_run(content, seed):
-    file = _file(content)
+    file = file_of(content)
     for number in range(8):
         _holds_in(file, Run(random.Random(seed + number), clamped=True, reaches=True))
 
 
-@given(begins=st.sampled_from([[], [_RELEASE], [_RELEASE, {"do": "turn_to", "angle_rad": 0.1}]]), content=_GRIPPED,
+@given(begins=st.sampled_from([[], [_RELEASE], [_RELEASE, {"do": "turn_to", "angle_rad": 0.1}]]), content=GRIPPED,
        seed=st.integers(0, 2**32))  # fmt: skip
 @settings(max_examples=400, deadline=None)
 def test_what_the_plan_says_of_a_gripped_tool_holds_in_every_run(begins, content, seed):
-    file = _file([*begins, _GRIP, *content])
+    file = file_of([*begins, _GRIP, *content])
     for number in range(8):
         _holds_in(file, Run(random.Random(seed + number), clamped=False, reaches=True))
 
 
-@given(content=_CLAMPED, seed=st.integers(0, 2**32), twisted_rad=st.sampled_from([0.0, 0.01, 0.4]))
+@given(content=CLAMPED, seed=st.integers(0, 2**32), twisted_rad=st.sampled_from([0.0, 0.01, 0.4]))
 @settings(max_examples=200, deadline=None)
 def test_a_direction_that_assumes_nothing_holds_for_every_tool_and_every_tighten(content, seed, twisted_rad):
     """Also where the tool is turned and loaded at the start, and a `tighten` ends at its angle."""
-    file = _file(content)
+    file = file_of(content)
     said = list(turns(file, known_at_start(loaded=True, twisted_rad=twisted_rad), reaches=False))
     for number in range(8):
         run = Run(random.Random(seed + number), clamped=True, reaches=False)
@@ -254,17 +254,17 @@ def test_a_direction_that_assumes_nothing_holds_for_every_tool_and_every_tighten
         for step, turn in zip(file.steps, said, strict=True):
             try:
                 run.do(step)
-            except _EndedError:
+            except EndedError:
                 break
             first = next(iter(ways(run)), None)
             assert first in turn.begins or (first is None and len(turn.begins) == 1), (step, turn)
 
 
-@given(content=st.one_of(_CLAMPED, _GRIPPED), seed=st.integers(0, 2**32))
+@given(content=st.one_of(CLAMPED, GRIPPED), seed=st.integers(0, 2**32))
 @settings(max_examples=300, deadline=None)
 def test_a_step_loads_a_held_tool_only_in_directions_that_it_says(content, seed):
     """Of each tool: it is turned and loaded at the start, slips and relaxes."""
-    file = _file(content)
+    file = file_of(content)
     said = list(turns(file, NOTHING_KNOWN))
     for number in range(8):
         run = Run(random.Random(seed + number), clamped=False, reaches=False)
@@ -273,7 +273,7 @@ def test_a_step_loads_a_held_tool_only_in_directions_that_it_says(content, seed)
             before = run.torque
             try:
                 run.do(step)
-            except _EndedError:
+            except EndedError:
                 break
             for direction in BOTH_DIRECTIONS - turn.may_load:
                 most = max(SIGNS[direction] * torque for torque in (0.0, before, *run.torques))
@@ -340,7 +340,7 @@ LINE = {"do": "approach", "along_tool_m": 0.01}
     ],
 )
 def test_a_direction_is_said_where_it_is_known_and_only_there(content, direction, reverses, may_reverse):
-    plan = plan_of(_file([_RELEASE, _GRIP, *content]))
+    plan = plan_of(file_of([_RELEASE, _GRIP, *content]))
     last = plan.steps[-1]
     assert (last.direction, last.reverses, last.may_reverse) == (direction, reverses, may_reverse)
     said = "\n".join(plan.sentences())
@@ -351,10 +351,10 @@ def test_a_direction_is_said_where_it_is_known_and_only_there(content, direction
 
 def test_an_angle_of_the_wrist_joint_counts_with_the_angle_of_the_grip():
     turn, twist = {"do": "turn_to", "angle_rad": 1.4}, _twist(1.3, absolute=True)
-    plan = plan_of(_file([_RELEASE, turn, _GRIP, _hold(0.1), _twist(0.2), twist]))
+    plan = plan_of(file_of([_RELEASE, turn, _GRIP, _hold(0.1), _twist(0.2), twist]))
     assert plan.steps[-1].direction == CW
     far = {**_twist(6.0, absolute=True), "limits": {"angle_rad": 4.0}}
-    notes = plan_of(_file([_RELEASE, turn, _GRIP, far])).steps[-1].notes
+    notes = plan_of(file_of([_RELEASE, turn, _GRIP, far])).steps[-1].notes
     assert any("4.6 rad (264°) from the grip: the limit stops it at 4 rad" in note for note in notes)
 
 
@@ -363,7 +363,7 @@ def test_an_angle_of_the_wrist_joint_counts_with_the_angle_of_the_grip():
 )
 def test_the_plan_says_what_it_assumes_of_a_tool_that_is_held_at_the_start(content, assumes):
     """The question before a start knows whether the tool is turned, and assumes nothing."""
-    file = _file(content)
+    file = file_of(content)
     assert ("neither turned nor loaded" in plan_of(file).assumed) is assumes
     turned = plan_of(file, start=NOTHING_KNOWN)
     assert turned.assumed == ""
@@ -371,7 +371,7 @@ def test_the_plan_says_what_it_assumes_of_a_tool_that_is_held_at_the_start(conte
 
 
 def test_a_direction_that_rests_on_a_tighten_says_so():
-    notes = plan_of(_file([_RELEASE, _GRIP, _tighten(CW), _hold(-0.05)])).steps[-1].notes
+    notes = plan_of(file_of([_RELEASE, _GRIP, _tighten(CW), _hold(-0.05)])).steps[-1].notes
     assert any("if the `tighten` before it ends at its angle" in note for note in notes)
-    notes = plan_of(_file([_RELEASE, _GRIP, _tighten(CW), _hold(0.05)])).steps[-1].notes
+    notes = plan_of(file_of([_RELEASE, _GRIP, _tighten(CW), _hold(0.05)])).steps[-1].notes
     assert not any("ends at its angle" in note for note in notes)

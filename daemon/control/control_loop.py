@@ -364,6 +364,7 @@ class ControlLoop:
         runs = running.phase is ExperimentPhase.RUNNING
         return RunningStep(
             torque_needed=needed and runs,
+            has_zero=not self.wrist.source.needs_zero or self.has_zero(self.wrist.source.name),
             grasp=grasp,
             twisted_rad=self.tool.twisted_rad,
             expected_nm=controller.torque_nm if controller is not None else None,

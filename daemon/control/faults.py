@@ -77,6 +77,12 @@ class FaultCode(Enum):
         hold_at_most_s=5.0,
         timer="torque source",
     )
+    ZERO_LOST = Rule(
+        _KEEP,
+        "the torque that drives the wrist counts from no known zero: {detail}.",
+        "Take the tool out with `shearloop command release --yes`, or turn a clamped one back at the pendant; then send "
+        "`shearloop command unlock`, and take the zero with nothing gripped: `shearloop command tare`, or a step `tare`.",
+    )
     ESTIMATE_INVALID = Rule(
         _HOLD,
         "the torque estimate is not valid: {detail}.",

@@ -834,6 +834,65 @@ def test_no_torque_without_a_zero_turns_a_tool():
     assert "no zero of the load_cell" in refusal(twist)
 
 
+def with_a_zero(*steps: dict[str, Any]) -> Rig:
+    """Return a rig whose load cell drives these steps, and has its zero."""
+    rig = Rig(new_loop(needs_zero=True))
+    rig.control_loop.on_zero("load_cell")
+    return started(rig, *steps, torque_source="load_cell")
+
+
+def replug(rig: Rig) -> None:
+    rig.control_loop.on_link("load_cell", "it was unplugged", up=False)
+    rig.run(0.5)
+    rig.control_loop.on_link("load_cell", "", up=True)
+
+
+IDENTIFIED = GRIP, {"do": "identify"}
+TIGHTEN = {"do": "tighten", "direction": "clockwise", "until_torque_nm": 0.2, "until_angle_rad": 0.5}
+
+
+@pytest.mark.parametrize("paused", [False, True])
+@pytest.mark.parametrize(
+    ("steps", "at"),
+    [
+        ((*IDENTIFIED, {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 60}), 3),
+        ((GRIP, {"do": "twist", "angles_rad": [0.1], "hold_s": 60}), 2),
+        ((GRIP, {"do": "wait", "wait_s": 2}, {"do": "twist", "angles_rad": [0.1]}), 2),
+        (({"do": "wait", "wait_s": 2}, GRIP, TIGHTEN), 1),
+    ],
+)
+def test_no_torque_whose_zero_was_lost_in_an_experiment_turns_a_tool_further(steps, at, paused):
+    """A board may come back with another zero, and each limit would be off by the difference."""
+    rig = with_a_zero(*steps)
+    experiment = rig.control_loop.experiment
+    while experiment.step_number < at:
+        rig.step()
+    rig.run(1.5)
+    if paused:
+        assert rig.control_loop.pause() is None
+    before_rad = rig.wrist_rad
+    replug(rig)
+    rig.run(3.0)
+    if paused:
+        assert rig.control_loop.resume() is None
+    rig.run(10.0)
+    assert phase(rig) is ExperimentPhase.STOPPED
+    assert FaultCode.ZERO_LOST in {fault.code for fault in rig.control_loop.safety.waiting.faults}
+    assert "load_cell" in experiment.stop_reason
+    # A step is judged from its second tick on.
+    assert rig.wrist_rad == pytest.approx(before_rad, abs=2e-3)
+
+
+def test_a_zero_that_is_taken_again_lets_the_experiment_go_on():
+    rig = with_a_zero({"do": "wait", "wait_s": 2}, {"do": "tare"}, GRIP, {"do": "twist", "angles_rad": [0.1]})
+    replug(rig)
+    while rig.control_loop.experiment.step_number < 3:
+        rig.step()
+    rig.control_loop.on_zero("load_cell")
+    rig.run(20.0)
+    assert phase(rig) is ExperimentPhase.DONE
+
+
 def test_a_torque_that_has_fallen_silent_is_not_published_as_present():
     rig = holding("load_cell")
     assert rig.control_loop.pause() is None

@@ -48,8 +48,8 @@ def faults(
     """Return what is detected while a gripped tool is twisted, unless something else is said."""
     watched = Watched(driving=driving, supervising=supervising, config=LoopConfig(), required=required)
     step = RunningStep(
-        torque_needed=True, grasp=Grasp.HELD, twisted_rad=0.0, expected_nm=None, not_following="", overdue=None,
-        others_requests=0,
+        torque_needed=True, has_zero=True, grasp=Grasp.HELD, twisted_rad=0.0, expected_nm=None, not_following="",
+        overdue=None, others_requests=0,
     )  # fmt: skip
     return detect_faults(senses, watched, ExperimentLimits(), replace(step, **changes), t_ns)
 

@@ -18,6 +18,7 @@ from shearloop.daemon.control.experiment_schema import (
     GripStep,
     IdentifyStep,
     TareStep,
+    TurnToStep,
 )
 from shearloop.daemon.control.fault_detection import Grasp, RunningStep, Watched, compared_for_s, detect_faults
 from shearloop.daemon.control.faults import Fault, FaultCode, Response
@@ -364,7 +365,7 @@ class ControlLoop:
         runs = running.phase is ExperimentPhase.RUNNING
         return RunningStep(
             torque_needed=needed and runs,
-            has_zero=not self.wrist.source.needs_zero or self.has_zero(self.wrist.source.name),
+            lacks_zero=self._lacks_zero(running),
             grasp=grasp,
             twisted_rad=self.tool.twisted_rad,
             expected_nm=controller.torque_nm if controller is not None else None,
@@ -372,6 +373,15 @@ class ControlLoop:
             overdue=running.overdue,
             others_requests=self.tool.others_requests,
         )
+
+    def _lacks_zero(self, running: Experiment) -> bool:
+        """Return whether the present step needs a zero of the driving torque that is not known.
+
+        As at the start, a clamped tool may be turned back by a `turn_to` without one.
+        """
+        driving = self.wrist.source
+        turns_back = isinstance(running.step, TurnToStep) and not self.tool.has_gripper
+        return driving.needs_zero and not turns_back and not self.has_zero(driving.name)
 
     def _grasp(self, command: StepCommand) -> Grasp:
         if isinstance(command.action, GripStep):
@@ -439,7 +449,12 @@ class ControlLoop:
         gripped_at_rad = self.tool.count_angle(tick.wrist_rad)
         clock_stands = tick.on_hold or (experiment.command.turns and bool(tick.awaited))
         experiment.update(
-            tick.t_ns, tick.wrist_rad, torque_nm, gripped_at_rad=gripped_at_rad, clock_stands=clock_stands
+            tick.t_ns,
+            tick.wrist_rad,
+            torque_nm,
+            ramp_nm=self.wrist.ramp_nm,
+            gripped_at_rad=gripped_at_rad,
+            clock_stands=clock_stands,
         )
         # After a stop, the gripper's doubt may arrive only now. A `grip` that may meet nothing allows turns, although a
         # tool as wide as its target is not felt: it is watched like a held one.

@@ -4,6 +4,7 @@ Each step is a generator that receives a `StepContext`, yields a `StepCommand`, 
 clock stands while it is paused, or while the control loop says so, as during a hold.
 """
 
+import math
 from collections.abc import Generator
 from dataclasses import dataclass
 from enum import Enum
@@ -18,6 +19,8 @@ from shearloop.daemon.torques import SIGNS
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
+# A ramp has ended at its set point but for rounding.
+RAMPED_NM = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +60,15 @@ Action: TypeAlias = steps.ApproachStep | steps.GripStep | steps.TareStep | steps
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Input of a step: the wrist joint's angle now and at the grip, and the driving torque.
+    """Input of a step: the wrist joint's angle now and at the grip, the driving torque, and where its ramp is.
 
-    `torque_nm` is None without a fresh valid estimate. `elapsed_s` is the experiment's time.
+    `torque_nm` is None without a fresh valid estimate, `ramp_nm` without a closed loop. `elapsed_s` is the experiment's
+    time.
     """
 
     wrist_rad: float
     torque_nm: float | None
+    ramp_nm: float | None
     gripped_at_rad: float
     elapsed_s: float
 
@@ -157,19 +162,20 @@ class Experiment:
         wrist_rad: float,
         torque_nm: float | None,
         *,
+        ramp_nm: float | None = None,
         gripped_at_rad: float = 0.0,
         clock_stands: bool = False,
     ) -> None:
         """Choose the command for now, unless the experiment is paused or its clock has to stand.
 
-        The angles are the wrist joint's: now, and at the grip.
+        The angles are the wrist joint's: now, and at the grip. `ramp_nm` is the torque that the closed loop asks for.
         """
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         if clock_stands or self.phase is not ExperimentPhase.RUNNING:
             return
         self._elapsed_s += passed_s
-        context = StepContext(wrist_rad, torque_nm, gripped_at_rad, self._elapsed_s)
+        context = StepContext(wrist_rad, torque_nm, ramp_nm, gripped_at_rad, self._elapsed_s)
         try:
             self.command = self._program.send(context)
         except StopIteration:
@@ -306,7 +312,11 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
     tolerance_nm = max(TORQUE_TOLERANCE * abs(torque_nm), 1e-3)
     while True:
         context = yield StepCommand(track, activity=f"bringing the torque to {torque_nm:+.3f} N·m")
-        if context.torque_nm is not None and abs(context.torque_nm - torque_nm) <= tolerance_nm:
+        if context.torque_nm is None or context.ramp_nm is None:
+            continue
+        # The hold counts from the ramp's end, not from where the torque comes near it.
+        ramped = math.isclose(context.ramp_nm, torque_nm, abs_tol=RAMPED_NM)
+        if ramped and abs(context.torque_nm - torque_nm) <= tolerance_nm:
             break
     yield from _wait(track, step.hold_s, context.elapsed_s, f"holding {torque_nm:+.3f} N·m", 1)
 

@@ -57,8 +57,8 @@ class RunningStep:
 
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool
-    # Whether the driving torque counts from a zero that is known, or needs none.
-    has_zero: bool
+    # Whether the driving torque needs a zero, and it is not known.
+    lacks_zero: bool
     grasp: Grasp
     twisted_rad: float
     # The torque that the closed loop expects, None without one.
@@ -149,7 +149,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     judged = [one for one in (*watched.supervising, driving) if not (one.from_robot and robot_is_silent)]
     unusable = {one.name: fault for one in judged if (fault := _unusable(inputs, one, t_ns)) is not None}
     found = [*unusable.values()]
-    if not step.has_zero:
+    if step.lacks_zero:
         lost = f"{driving.name} was disconnected, or its zero was not taken, so its torques may be off by any load"
         found.append(Fault(FaultCode.ZERO_LOST, lost))
     if driving.name not in unusable and step.expected_nm is not None:

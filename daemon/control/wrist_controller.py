@@ -66,6 +66,11 @@ class WristController:
         self._sent_rad_per_s = 0.0
         self._turned_ns = 0
 
+    @property
+    def ramp_nm(self) -> float | None:
+        """The torque that the closed loop asks for at present, on its way to the set point; None without one."""
+        return self.controller.ramp_nm if self.controller is not None else None
+
     def on_torque(self, torque: TorqueSample) -> None:
         """Give a torque to the identification, and to the closed loop with the next angle."""
         if self.excitation is not None:

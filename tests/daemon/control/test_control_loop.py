@@ -834,6 +834,18 @@ def test_no_torque_without_a_zero_turns_a_tool():
     assert "no zero of the load_cell" in refusal(twist)
 
 
+IDENTIFIED = GRIP, {"do": "identify"}
+
+
+def test_a_hold_counts_from_the_end_of_the_ramp():
+    """Within its tolerance of the set point the torque is still on its way there."""
+    slow = {"do": "hold_torque", "torque_nm": 0.2, "ramp_nm_per_s": 0.01, "hold_s": 0.0}
+    rig = started(Rig(new_loop()), *IDENTIFIED, slow, torque_source="load_cell")
+    rig.run(120.0)
+    assert phase(rig) is ExperimentPhase.DONE
+    assert rig.true_nm[-1] == pytest.approx(0.2, rel=0.03)
+
+
 def with_a_zero(*steps: dict[str, Any]) -> Rig:
     """Return a rig whose load cell drives these steps, and has its zero."""
     rig = Rig(new_loop(needs_zero=True))
@@ -847,7 +859,6 @@ def replug(rig: Rig) -> None:
     rig.control_loop.on_link("load_cell", "", up=True)
 
 
-IDENTIFIED = GRIP, {"do": "identify"}
 TIGHTEN = {"do": "tighten", "direction": "clockwise", "until_torque_nm": 0.2, "until_angle_rad": 0.5}
 
 

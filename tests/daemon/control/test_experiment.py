@@ -42,7 +42,9 @@ class Bench:
         if self.wish.action:
             self.machine.end_action()
         torque_nm = STIFFNESS_NM_PER_RAD * self.wrist_rad
-        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, clock_stands=clock_stands)
+        # A ramp of no time.
+        ramp_nm = self.wish.wrist.torque_nm if isinstance(self.wish.wrist, TrackTorque) else None
+        self.machine.update(self.t_ns, self.wrist_rad, torque_nm, ramp_nm=ramp_nm, clock_stands=clock_stands)
         wish = self.machine.command
         if wish.action is not None and self.machine.begin_action():
             self.begun.append(type(wish.action).__name__)

@@ -48,7 +48,7 @@ def faults(
     """Return what is detected while a gripped tool is twisted, unless something else is said."""
     watched = Watched(driving=driving, supervising=supervising, config=LoopConfig(), required=required)
     step = RunningStep(
-        torque_needed=True, has_zero=True, grasp=Grasp.HELD, twisted_rad=0.0, expected_nm=None, not_following="",
+        torque_needed=True, lacks_zero=False, grasp=Grasp.HELD, twisted_rad=0.0, expected_nm=None, not_following="",
         overdue=None, others_requests=0,
     )  # fmt: skip
     return detect_faults(senses, watched, ExperimentLimits(), replace(step, **changes), t_ns)

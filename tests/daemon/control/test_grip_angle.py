@@ -132,6 +132,16 @@ def clamped_rig() -> Rig:
     return rig
 
 
+def test_a_clamped_tool_is_turned_back_without_a_zero():
+    """It is the way out where a lost zero has stopped a twist."""
+    rig = clamped_rig()
+    sources = {"right": EIT, "load_cell": replace(LOAD, needs_zero=True)}
+    rig.control_loop = ControlLoop(CONFIG, sources, ("right",))
+    started(rig, {"do": "turn_to", "angle_rad": rig.wrist_rad + 0.1}, torque_source="load_cell")
+    rig.run(20)
+    assert phase(rig) is ExperimentPhase.DONE, rig.control_loop.experiment.stop_reason
+
+
 def turn_to_limit(rig: Rig) -> float:
     """Run the twist by 0.25 of 0.3 rad once more, and return how far the wrist has turned in it."""
     begun_rad = rig.wrist_rad

@@ -229,7 +229,7 @@ def known_at_start(*, loaded: bool, twisted_rad: float, wrist_rad: float | None 
     """
     stands_rad = UNKNOWN if wrist_rad is None else exactly(wrist_rad)
     if not loaded:
-        return replace(AT_REST, wrist_rad=stands_rad)
+        return replace(AT_REST, wrist_rad=stands_rad, origin_rad=wrist_rad)
     angle_rad = UNKNOWN if abs(twisted_rad) > UNTURNED_RAD else UNKNOWN.within(UNTURNED_RAD)
     return replace(NOTHING_KNOWN, angle_rad=angle_rad, wrist_rad=stands_rad)
 

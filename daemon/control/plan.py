@@ -301,11 +301,11 @@ def _why_way_unknown(step: Step) -> str:
 
 
 def _assumed(file: ExperimentFile) -> str:
-    """Return what the directions assume of a tool that may be held at the start; empty if none depends on it."""
+    """Return what the plan assumes of a tool that may be held at the start; empty if no direction depends on it."""
     if any(map(_is_less_certain, turns(file), turns(file, NOTHING_KNOWN))):
         return (
-            "the directions assume that a tool that is held at the start is neither turned nor loaded then; the plan "
-            "before a start does not, because the daemon knows whether it is turned"
+            "directions and durations assume that a tool that is held at the start is neither turned nor loaded then; "
+            "the plan before a start does not, because the daemon knows whether it is turned"
         )
     return ""
 

@@ -23,11 +23,14 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.known_tool import AT_REST, Interval, KnownTool, known_after
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 from shearloop.drivers.ranges import LARGEST_ANGLE_RAD
+from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, along_tool, turn_between
 from shearloop.drivers.ur.settings import UrLimits
 
 # The largest UR arm reaches as far.
 _REACH_M: Final = 1.75
+# A motion of the fingers at their default speed, and the time to begin one and to see its end.
+_FINGERS_S, _BEGINS_S = 3.0, 0.7
 # How far a turn to an angle of the wrist joint goes, as a guess: without a tool, and as a twist.
 _GUESSED_TURN_RAD, _GUESSED_TWIST_RAD = 1.0, 0.2
 
@@ -135,8 +138,9 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
         case IdentifyStep(amplitude_rad=angle_rad, hold_s=hold_s):
             # Two cycles at least, to half of the angle and to all of it; the first of five rests is twice as long.
             moves_s = 3.0 * angle_rad / speeds.wrist_rad_per_s + 5.0 * SETTLES_S
-            # Up to eight cycles: 17 rests, of which twelve are longer by 0.5 periods of a torque on average.
-            longer_s = 12.0 * (angle_rad / speeds.wrist_rad_per_s + hold_s + SETTLES_S) + 4.0
+            # Up to eight cycles: twelve more rests, each after a turn that begins and ends gently. To sample each swing
+            # at other phases, the rests are longer by up to 0.75 periods of the torque.
+            longer_s = 12.0 * (angle_rad / speeds.wrist_rad_per_s + hold_s + 2.0 * SETTLES_S) + 6.0
             return Demand(0.0, angle_rad, 6.0 * hold_s, moves_s, moves_s + longer_s, angle_rad)
         case TwistStep(angles_rad=angles_rad):
             most_rad = 0.0 if step.absolute else max(map(abs, angles_rad))
@@ -155,7 +159,13 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
         case ApproachStep(pose_m_rad=tuple() as pose):
             longest_s = 1.0 + _farthest_line_s(step, pose, speeds, before.robot)
             return Demand(moves_s=min(3.0, longest_s), longest_moves_s=longest_s, depends_on="where the arm stands")
-        case ApproachStep() | GripStep() | ReleaseStep() | AdaptStep():
+        case GripStep(width_mm=width_mm, speed_mm_per_s=speed_mm_per_s):
+            longest_s = _BEGINS_S + (LARGEST_STROKE_MM - width_mm) / speed_mm_per_s
+            fingers = "how far the fingers are apart" if longest_s > _FINGERS_S else ""
+            return Demand(moves_s=_FINGERS_S, longest_moves_s=longest_s, depends_on=fingers)
+        case ReleaseStep():
+            return Demand(moves_s=_FINGERS_S)
+        case ApproachStep() | AdaptStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():
             return Demand()

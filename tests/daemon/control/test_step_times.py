@@ -131,6 +131,17 @@ def test_the_remaining_time_counts_the_torque_before_and_where_the_wrist_stands(
     assert (rig.tick - began[6]) * TICK_S == pytest.approx(left_s[6], rel=0.25)
 
 
+def test_an_identification_with_much_noise_takes_no_longer_than_the_plan_says():
+    identify = {"do": "identify", "amplitude_rad": 0.15}
+    rig = started(Rig(new_loop()), GRIP, identify, torque_source="right", limits=LIMITS)
+    while rig.control_loop.experiment.step_number == 1:
+        rig.step()
+    begun = rig.tick
+    rig.run(120)
+    took_s, said = (rig.tick - begun) * TICK_S, _last(GRIP, identify, loop=rig.control_loop.config)
+    assert said.duration_s < took_s <= said.longest_s
+
+
 def _last(*content: dict[str, Any], **keys: Any) -> StepPlan:
     file = ExperimentFile.model_validate({"name": "one", "limits": LIMITS, "steps": content})
     return plan_of(file, **keys).steps[-1]
@@ -148,6 +159,9 @@ def _last(*content: dict[str, Any], **keys: Any) -> StepPlan:
         ([], {"do": "turn_to", "angle_rad": 6.0, "speed_rad_per_s": 0.1, "timeout_s": 124}, False),
         ([], {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0], "timeout_s": 20}, True),
         ([GRIP], {"do": "identify", "timeout_s": 30}, True),
+        # 130 mm at 20 mm/s.
+        ([], {**GRIP, "speed_mm_per_s": 20, "timeout_s": 6}, True),
+        ([], {**GRIP, "speed_mm_per_s": 20, "timeout_s": 8}, False),
     ],
 )
 def test_a_timeout_that_an_unknown_state_may_exceed_is_named(before, step, warned):

@@ -242,15 +242,23 @@ def test_what_the_plan_says_of_a_gripped_tool_holds_in_every_run(begins, content
         _holds_in(file, Run(random.Random(seed + number), clamped=False, reaches=True))
 
 
-@given(content=CLAMPED, seed=st.integers(0, 2**32), twisted_rad=st.sampled_from([0.0, 0.01, 0.4]))
-@settings(max_examples=200, deadline=None)
-def test_a_direction_that_assumes_nothing_holds_for_every_tool_and_every_tighten(content, seed, twisted_rad):
+@given(content=CLAMPED, seed=st.integers(0, 2**32), twisted_rad=st.sampled_from([0.0, 0.01, 0.4]),
+       loaded=st.booleans(), wrist_is_known=st.booleans())  # fmt: skip
+@settings(max_examples=400, deadline=None)
+def test_a_direction_that_assumes_nothing_holds_for_every_tool_and_every_tighten(
+    content, seed, twisted_rad, loaded, wrist_is_known
+):
     """Also where the tool is turned and loaded at the start, and a `tighten` ends at its angle."""
     file = file_of(content)
-    said = list(turns(file, known_at_start(loaded=True, twisted_rad=twisted_rad), reaches=False))
     for number in range(8):
         run = Run(random.Random(seed + number), clamped=True, reaches=False)
-        run.angle, run.torque = twisted_rad, run.rng.uniform(-0.05, 0.05)
+        run.angle = twisted_rad
+        if loaded:
+            run.torque = run.rng.uniform(-0.05, 0.05)
+        else:
+            run.origin, run.angle = run.origin + run.angle, 0.0
+        wrist_rad = run.origin + run.angle if wrist_is_known else None
+        said = turns(file, known_at_start(loaded=loaded, twisted_rad=twisted_rad, wrist_rad=wrist_rad), reaches=False)
         for step, turn in zip(file.steps, said, strict=True):
             try:
                 run.do(step)

@@ -359,7 +359,9 @@ class Recorder:
 
         `states_follow`: the states of all sources were asked for when the next item was queued.
         """
-        if not self._flush():
+        self._current.file.free_if_deleted()
+        # What cannot be written into a removed file keeps no new one from beginning.
+        if not self._flush() and not self._current.file.is_removed():
             return
         previous, lost = self._current, dropped + self._counts.unwritable
         try:

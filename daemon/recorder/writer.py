@@ -184,6 +184,14 @@ class McapFile:
         except OSError:
             return True
 
+    def free_if_deleted(self) -> None:
+        """Give the disk's room back if the file was deleted: until it is closed it takes as much as before.
+
+        A file that was only moved stays as it is.
+        """
+        if os.fstat(self._file.fileno()).st_nlink == 0:
+            self._file.truncate(0)
+
     def discard(self) -> None:
         """Close the file, and delete it if it is still there."""
         removed = self.is_removed()

@@ -469,6 +469,24 @@ def test_a_removed_file_is_a_failure_and_a_new_one_begins(removed, tmp_path):
     assert not replaced.exists() or replaced.read_text() == "another's file"
 
 
+@pytest.mark.parametrize("small_disk", ["256k"], indirect=True)
+def test_deleting_the_recordings_makes_room_on_a_full_disk(small_disk):
+    """Also the one that is being written, whose room is free only once the program lets go of it."""
+    recorder = Recorder(small_disk, IDENTITY, Clock())
+    while not recorder.failure:
+        recorder.record_message("eit.frame", frame(0))
+        recorder.write()
+    assert "No space left on device" in recorder.failure
+    recorder.path.unlink()
+    recorder.write()
+    recorder.record_message("load.torque", torque(1))
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    (path,) = recorder.closed_files
+    assert [one["seq"] for one in topics(path)["load.torque"]] == [1]
+
+
 async def test_a_removed_recording_is_not_logged_as_recorded(config):
     with zmq.asyncio.Context() as context, capture_logs() as logs:
         daemon = Daemon(load_daemon_config(config(recording={"folder": "recordings"})), context)

@@ -9,6 +9,7 @@ from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
     ExperimentFile,
+    GripperStep,
     GripStep,
     HoldTorqueStep,
     IdentifyStep,
@@ -31,6 +32,8 @@ from shearloop.drivers.ur.settings import UrLimits
 _REACH_M: Final = 1.75
 # A motion of the fingers at their default speed, and the time to begin one and to see its end.
 _FINGERS_S, _BEGINS_S = 3.0, 0.7
+# A reset and a pause, and the fingers open and close once.
+_ACTIVATES_S = 5.0
 # How far a turn to an angle of the wrist joint goes, as a guess: without a tool, and as a twist.
 _GUESSED_TURN_RAD, _GUESSED_TWIST_RAD = 1.0, 0.2
 
@@ -74,6 +77,8 @@ class Before(NamedTuple):
     limit_nm: float = math.inf
     limit_rad: float = math.inf
     robot: UrLimits | None = None
+    # Whether the gripper may be inactive, as after a loss of power: a release activates it then.
+    may_be_inactive: bool = False
 
 
 NOTHING_BEFORE: Final = Before()
@@ -83,10 +88,12 @@ def demands(
     file: ExperimentFile, speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST, robot: UrLimits | None = None
 ) -> Iterator[Demand]:
     """Yield the demand of each step after those before it."""
-    tool, pose_m_rad = start, None
+    tool, pose_m_rad, may_be_inactive = start, None, True
     for step in file.steps:
         limits = file.limits_of(step)
-        yield demand(step, speeds, Before(tool, pose_m_rad, limits.torque_nm, limits.angle_rad, robot))
+        before = Before(tool, pose_m_rad, limits.torque_nm, limits.angle_rad, robot, may_be_inactive)
+        yield demand(step, speeds, before)
+        may_be_inactive = may_be_inactive and not isinstance(step, GripperStep)
         # A `tighten` may end at its angle, without its torque.
         tool, pose_m_rad = known_after(step, tool, reaches=False), _pose_after(step, pose_m_rad)
 
@@ -164,7 +171,8 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
             fingers = "how far the fingers are apart" if longest_s > _FINGERS_S else ""
             return Demand(moves_s=_FINGERS_S, longest_moves_s=longest_s, depends_on=fingers)
         case ReleaseStep():
-            return Demand(moves_s=_FINGERS_S)
+            longest_s = _FINGERS_S + (_ACTIVATES_S if before.may_be_inactive else 0.0)
+            return Demand(moves_s=_FINGERS_S, longest_moves_s=longest_s)
         case ApproachStep() | AdaptStep():
             return Demand(moves_s=3.0)
         case HoldTorqueStep() | TightenStep() | IdentifyStep() | TwistStep() | TurnToStep() | WaitStep():

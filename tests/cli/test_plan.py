@@ -50,8 +50,7 @@ WRIST_IS_ANYWHERE = "how long it takes depends on where wrist 3 stands, and is a
 # The notes of the delivered experiments, by step.
 NOTES = {
     "torque_sweep": {
-        # From the other end of the joint's range.
-        3: [WRIST_IS_ANYWHERE, "its timeout_s of 30 s may stop it before its end"],
+        3: [WRIST_IS_ANYWHERE],
         # A straight line before it turns the wrist too, by what the plan does not know.
         7: [
             "a tool may be held, and turns too: which way, and how far, depends on where wrist 3 stands",

@@ -169,6 +169,13 @@ def test_a_timeout_that_an_unknown_state_may_exceed_is_named(before, step, warne
     assert any("may stop it before its end" in note for note in notes) is warned
 
 
+def test_only_the_first_release_may_take_as_long_as_an_activation():
+    """A real gripper takes two to four seconds for it, after a reset and a pause."""
+    first, _, again = plan_of(file_of([RELEASE, GRIP, RELEASE])).steps
+    assert first.longest_s == pytest.approx(first.duration_s + 5.0)
+    assert again.longest_s == again.duration_s == first.duration_s
+
+
 def test_a_first_turn_is_known_where_the_wrist_is():
     turn = {"do": "turn_to", "angle_rad": 6.0, "speed_rad_per_s": 0.1, "timeout_s": 60}
     guessed, known = _last(turn), _last(turn, start=known_at_start(loaded=False, twisted_rad=0.0, wrist_rad=1.0))

@@ -149,7 +149,7 @@ def _comparison_text(comparison: "ReplayComparison", made_by: str) -> list[str]:
         return lines or ["Nothing was compared: the recording has no estimates with raw input."]
     if comparison.before_state and not lines:
         early = counted(comparison.before_state.total(), "message follows", "messages follow")
-        lines.append(f"{early} from inputs before this recording, and were not compared.")
+        lines.append(f"Not compared: {early} from inputs before this recording.")
     for topic, count in sorted(comparison.compared.items()):
         different = comparison.different[topic]
         lines.append(f"{topic}: {count - different} of {count} equal the recorded ones, bit for bit")

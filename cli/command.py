@@ -146,7 +146,7 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
     # It imports too much for a `stop` on a busy computer.
     from shearloop.daemon.messaging.client import send_command
 
-    timeout_s = args.timeout
+    timeout_s, causes = args.timeout, ""
     if timeout_s is None:
         timeout_s = addresses.UNLOCK_TIMEOUT_S if args.name in addresses.SLOW else addresses.COMMAND_TIMEOUT_S
     if args.name not in _ACTS_ON_NOTHING_SHOWN:
@@ -157,15 +157,13 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
             return status
         request |= meant_for(status, 0.0 if args.name in NEVER_LATE else _age_s(args), TYPED_WITHIN_S)
         if args.name == "unlock":
-            request |= _acknowledged(status.get("loop", {}))
-    return send_command(args.connect, request, timeout_s, keys)
-
-
-def _acknowledged(loop: Mapping[str, Any]) -> dict[str, int]:
-    """Return the number of the stop that an unlock names, and print that stop."""
-    if loop.get("stop_causes"):
-        print(f"unlock acknowledges the stop: {loop['stop_causes']}.", file=sys.stderr)
-    return {"stop": loop["stop"]} if "stop" in loop else {}
+            loop = status.get("loop", {})
+            causes = loop.get("stop_causes", "")
+            request |= {"stop": loop["stop"]} if "stop" in loop else {}
+    reply = send_command(args.connect, request, timeout_s, keys)
+    if causes and reply.get("ok"):
+        print(f"unlock acknowledged the stop: {causes}.", file=sys.stderr)
+    return reply
 
 
 def _told(args: argparse.Namespace, reply: dict[str, Any]) -> int:

@@ -647,8 +647,20 @@ def test_a_command_names_the_running_daemon_and_unlock_names_the_waiting_stop(na
     assert main(["command", name, "--timeout", "60"]) == 0
     assert [one["command"] for one in asked] == ["status", name]
     assert (asked[1]["instance"], asked[1].get("stop")) == ("a1", 3 if name == "unlock" else None)
-    said = "unlock acknowledges the stop: the operator stopped it: nothing was under way.\n"
+    said = "unlock acknowledged the stop: the operator stopped it: nothing was under way.\n"
     assert capsys.readouterr().err == (said if name == "unlock" else "")
+
+
+def test_an_unlock_that_is_refused_acknowledges_nothing(monkeypatch, capsys):
+    loop = {"stop": 3, "stop_causes": "the operator stopped it: nothing was under way"}
+
+    def answers(_address: str, content: dict[str, Any], *_: object) -> dict[str, Any]:
+        is_asked = content["command"] == "status"
+        return {"ok": is_asked, "reason": "it is pressed", "daemon": {"instance": "a1"}, "loop": loop}
+
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
+    assert main(["command", "unlock"]) == 1
+    assert capsys.readouterr().err == "shearloop command: unlock was refused: it is pressed\n"
 
 
 @pytest.mark.parametrize("name", ["status", "start", "pause", "tare", "experiments"])

@@ -64,9 +64,13 @@ class LoadedFiles:
 
     @classmethod
     def of(cls, config: DaemonConfig, package: Path = PACKAGE) -> "LoadedFiles":
-        """Look at a configuration's own file, at all that it names but the experiment, and at the package's code."""
-        named = [path for key, path in config.walk() if isinstance(path, Path) and key != "experiment"]
-        return cls([*named, *((config.file,) if config.file is not None else ()), *code_of(package)])
+        """Look at a configuration's own file, at all that it names but the experiment, and at the package's code.
+
+        Of a rehearsal these are the files of the real configuration, which a person changes.
+        """
+        real = config.real
+        named = [path for key, path in real.walk() if isinstance(path, Path) and key != "experiment"]
+        return cls([*named, *((real.file,) if real.file is not None else ()), *code_of(package)])
 
     def why_outdated(self) -> str:
         """Return which file has changed since the daemon's start; empty if none has. It reads the files that may have.

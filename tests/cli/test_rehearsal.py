@@ -16,6 +16,7 @@ from shearloop.cli.init import packaged_files
 from shearloop.cli.rehearsal import rehearsal
 from shearloop.daemon.commissioning_report import Line, Report, StageResult
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.rig_identity import identity_of, judged_by, judged_sha256s
 from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.calibration_files import save_calibration
@@ -131,6 +132,18 @@ def test_the_first_lines_say_how_large_the_tool_of_every_experiment_is(real_rig,
     assert rig.diameter_mm == tool_mm
     assert f"a diameter of {tool_mm} mm, " in sentence
     assert "every experiment that you start grips this tool" in sentence
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("name", ["rig.yaml", "ur.yaml"])
+def test_a_rehearsal_notices_a_change_of_the_persons_own_files(real_rig, name):
+    path = real_rig("robot", "load_cell", "gripper")
+    with rehearsal(load_daemon_config(path), path) as rehearsed:
+        loaded = LoadedFiles.of(rehearsed.config)
+        assert loaded.why_outdated() == ""
+        changed = path.with_name(name)
+        changed.write_text(changed.read_text() + "# tighter\n")
+        assert loaded.why_outdated().startswith(f"{changed} has changed since the daemon began")
 
 
 def test_a_calibrated_load_cell_gets_the_counts_of_its_own_calibration(real_rig, tmp_path):

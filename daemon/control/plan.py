@@ -196,7 +196,7 @@ def plan_of(
             waits_s = warm_up_s
         if needs.depends_on:
             notes.append(f"how long it takes depends on {needs.depends_on}, and is a guess here")
-        if step.timeout_s is not None and needs.longest_s > step.timeout_s:
+        if step.timeout_s is not None and needs.safe_timeout_s > step.timeout_s:
             notes.append(f"its timeout_s of {step.timeout_s:g} s may stop it before its end")
         if number == untared:
             notes.append("no `tare` comes before it: the start is refused unless a zero is known")

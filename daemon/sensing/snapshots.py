@@ -17,7 +17,11 @@ import numpy as np
 from pydantic import BaseModel
 
 # Objects of these rooms have a state. The bank's are large, and follow from the configuration.
-_ROOMS = ("shearloop.bank.", "shearloop.estimation.", "shearloop.drivers.", "shearloop.daemon.sensing.")
+_ROOMS = (
+    *("shearloop.bank.", "shearloop.estimation.", "shearloop.drivers.", "shearloop.daemon.sensing."),
+    # Why a parser has refused its last line.
+    "shearloop.errors",
+)
 _PLAIN = (bool, int, float, str, type(None))
 _CONTAINERS = (list, dict, tuple, deque, Counter)
 # The key of a value that is not plain JSON.

@@ -1,8 +1,10 @@
 """The states of parsers: a restored parser continues like the stored one."""
 
+import numpy as np
 import pytest
 
 from shearloop.daemon.sensing.snapshots import SnapshotError, restored, snapshot
+from shearloop.drivers.eit_kit import FrameParser
 from shearloop.drivers.load_cell import LoadCalibration, LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
@@ -19,6 +21,16 @@ def test_a_restored_load_cell_takes_a_tare(calibration):
     for parser in (stored, restored_one):
         parser.handle(RawEvent(InputKind.TARE, 1, b"0.5"))
     assert restored_one.calibration == stored.calibration != calibration
+
+
+@pytest.mark.parametrize(
+    "parser", [LoadParser(LoadCalibration.of_torque_lines()), FrameParser(np.zeros((32, 28), dtype=bool))]
+)
+def test_a_parser_that_has_refused_a_line_is_restored_with_the_reason(parser):
+    parser.handle(RawEvent(InputKind.OPENED, 0))
+    parser.handle(RawEvent(InputKind.DATA, 10**9, b"its own line\r\nanother\r\nanother\r\n"))
+    assert parser.refusal is not None
+    assert restored(snapshot({"parser": parser}, {}), {}, {"parser": parser})["parser"].refusal == parser.refusal
 
 
 def test_a_state_without_an_attribute_that_the_program_needs_is_of_another_version():

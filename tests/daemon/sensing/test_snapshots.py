@@ -24,11 +24,11 @@ def test_a_restored_load_cell_takes_a_tare(calibration):
 
 
 @pytest.mark.parametrize(
-    "parser", [LoadParser(LoadCalibration.of_torque_lines()), FrameParser(np.zeros((32, 28), dtype=bool))]
+    "parser", [LoadParser(LoadCalibration.of_torque_lines()), FrameParser(np.zeros(896, dtype=bool))]
 )
 def test_a_parser_that_has_refused_a_line_is_restored_with_the_reason(parser):
     parser.handle(RawEvent(InputKind.OPENED, 0))
-    parser.handle(RawEvent(InputKind.DATA, 10**9, b"its own line\r\nanother\r\nanother\r\n"))
+    parser.handle(RawEvent(InputKind.DATA, 3 * 10**9, b"0.1, 0.2\r\n" * 5))
     assert parser.refusal is not None
     assert restored(snapshot({"parser": parser}, {}), {}, {"parser": parser})["parser"].refusal == parser.refusal
 

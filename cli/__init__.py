@@ -150,7 +150,8 @@ def _run(argv: Sequence[str] | None) -> int:
         if not interrupt_is_end:
             # A closed terminal accepts no output.
             with contextlib.suppress(OSError):
-                print(f"{program}: interrupted before it was done", file=sys.stderr)
+                kept = "".join(f". {note}" for note in getattr(interrupt, "__notes__", ()))
+                print(f"{program}: interrupted before it was done{kept}", file=sys.stderr)
         return interrupt_status(interrupt)
 
 

@@ -18,6 +18,7 @@ from multiprocessing import active_children, get_context
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from shearloop.errors import UserError, missing
+from shearloop.tools.interrupts import interrupts_held
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -58,7 +59,9 @@ class ProcessExecutor:
         # hangs that ends while it sends an item that is larger than a pipe.
         pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin, initargs=(shared,))
         try:
-            yield from pool.map(partial(_with_shared, function), items)
+            with interrupts_held():
+                results = pool.map(partial(_with_shared, function), items)
+            yield from results
             wanted = False
         except BrokenProcessPool as error:
             raise UserError("a process was killed, perhaps for lack of memory; run again with fewer --jobs") from error

@@ -280,6 +280,18 @@ def test_an_interrupted_command_reports_it_unless_it_only_waits(number, status, 
     assert ran("emulate", "rig", "--bank", "my.bank", "--run-dir", tmp_path, status=status) == ("", "")
 
 
+def test_an_interrupted_commissioning_says_how_to_continue(monkeypatch, ran, config, tmp_path):
+    def interrupted(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shearloop.tools.commission.procedure.commission", interrupted)
+    said = ran("commission", config(), "--out", tmp_path / "report.yaml", status=130).err
+    assert said == (
+        "shearloop commission: interrupted before it was done. What is measured so far is kept; run it again to "
+        "continue\n"
+    )
+
+
 def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):
     def interrupted(_: object) -> NoReturn:
         monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))

@@ -39,7 +39,7 @@ def measure(context: Context) -> Measured:
     )
     with context.gripper() as gripper:
         lines = [_activation(context, gripper), _exchanges(context, gripper)]
-        width_line, supplies = judge_widths(_gauges(context, gripper), config)
+        width_line, supplies = judge_widths(measured_gauges(context, gripper), config)
         return Measured([*lines, width_line, *_objects(context, gripper)], supplies)
 
 
@@ -80,9 +80,9 @@ def judge_exchanges(times_s: Sequence[float], longest_s: float) -> Line:
     )
 
 
-def _gauges(context: Context, gripper: Gripper) -> list[tuple[float, float]]:
+def measured_gauges(context: Context, gripper: Gripper) -> list[tuple[float, float]]:
     """Return (counts, mm) of gauges that the gripper held."""
-    gauges = []
+    gauges: list[tuple[float, float]] = []
     for number in range(1, context.counts.gauges + 1):
         question = f"Hold gauge {number} of {context.counts.gauges} between the fingers; its width in mm"
         for_instance_mm = gripper.model.stroke_mm * (number - 0.5) / context.counts.gauges
@@ -90,6 +90,12 @@ def _gauges(context: Context, gripper: Gripper) -> list[tuple[float, float]]:
             f"a gauge as wide as you type is held for you, for instance {for_instance_mm:g}", ("object {}",)
         )
         width_mm = context.operator.number(question, 0.5, gripper.model.stroke_mm, played)
+        if width_mm in [measured_mm for _, measured_mm in gauges]:
+            context.operator.say(
+                f"A gauge of {width_mm:g} mm was measured already: hold one of another width, or type {width_mm:g} "
+                "again to measure it a second time."
+            )
+            width_mm = context.operator.number(question, 0.5, gripper.model.stroke_mm, played)
         state = _close_and_open(context, gripper, f"gauge {number}")
         gauges.append((float(state.position_counts), width_mm))
     return gauges

@@ -18,6 +18,7 @@ from shearloop.drivers.ur.settings import UrSettings
 from shearloop.errors import UserError
 from shearloop.tools.commission.arrivals import REAL_CLOCK, Arrivals, Clock
 from shearloop.tools.commission.opened import Opened
+from shearloop.tools.interrupts import interrupts_held
 
 Event = dict[str, Any]
 # Requests that move the arm.
@@ -141,7 +142,8 @@ class MoverProcess(Mover, Opened):
     def start(self) -> None:
         """Start a process and its worker."""
         command = [sys.executable, "-m", "shearloop.tools.commission.mover_process", self.worker]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        with interrupts_held():
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         self._write(encode(self.settings).decode())
         self._reader = threading.Thread(target=self._read, args=(self._process,), name="mover", daemon=True)
         self._reader.start()

@@ -2,7 +2,8 @@
 
 Run it as `python -m shearloop.tools.commission.mover_process [WORKER]`. The first line of its input has the robot's
 settings. Each further line is one request in JSON. Each line of its output is one event in JSON. At the end of the
-input it stops the arm and disconnects. WORKER is the module of the worker, by default the daemon's worker.
+input, and after Ctrl-C, it stops the arm and disconnects. WORKER is the module of the worker, by default the daemon's
+worker.
 """
 
 import asyncio
@@ -37,6 +38,7 @@ from shearloop.tools.commission.bounds import LARGEST_M
 from shearloop.tools.commission.failing_worker import CLOSE_RTDE, NO_DEADLINES
 from shearloop.tools.commission.given_word import LONGEST_STANDSTILL_S
 from shearloop.tools.commission.mover import FAILING_WORKER, MOTIONS
+from shearloop.tools.interrupts import interrupts_let_through
 
 # The causes of a stop that a request may name: signals to the worker, then to this process.
 CAUSES: Final[Mapping[str, tuple[signal.Signals | None, signal.Signals | None]]] = {
@@ -253,11 +255,19 @@ class ThisProcess:
 
 
 async def main(worker_module: str) -> None:
-    """Serve requests until the input ends."""
+    """Serve requests until the input ends or Ctrl-C comes."""
     loop = asyncio.get_running_loop()
     lines = asyncio.StreamReader()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
-    ((_, settings),) = MessageDecoder().feed(await lines.readline())
+    reading, _ = await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(lines), sys.stdin)
+    loop.add_signal_handler(signal.SIGINT, reading.close)
+    with interrupts_let_through():
+        await _serve(lines, worker_module)
+
+
+async def _serve(lines: asyncio.StreamReader, worker_module: str) -> None:
+    if not (first := await lines.readline()):
+        return
+    ((_, settings),) = MessageDecoder().feed(first)
     if not isinstance(settings, UrSettings):
         raise SystemExit(2)
     robot, process = UrRobot(settings, LinkMonitor(), worker=worker_module), ThisProcess(worker_module)

@@ -17,6 +17,7 @@ from shearloop.drivers.ur.script import ScriptRegisters
 from shearloop.errors import UserError
 from shearloop.tools.commission.observer import Observer, Seen
 from shearloop.tools.commission.opened import Opened
+from shearloop.tools.interrupts import interrupts_held
 
 _OUTPUTS = TypeAdapter(RtdeOutputs)
 _CONNECTS_WITHIN_S = 10.0
@@ -58,7 +59,9 @@ class ObserverProcess(Observer, Opened):
 
     def open(self) -> None:
         """Start the process; raises UserError where it receives nothing."""
-        self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE)
+        # Ctrl-C is for the commissioning, which ends this process.
+        with interrupts_held():
+            self._process = subprocess.Popen(self._command, stdout=subprocess.PIPE)
         self._reader = threading.Thread(target=self._read, args=(self._process,), name="observer", daemon=True)
         self._reader.start()
         if self.wait_for(lambda _: True, self.clock.now_ns(), _CONNECTS_WITHIN_S) is None:

@@ -1,6 +1,5 @@
 """The questions of a commissioning to the person at the robot."""
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
@@ -13,6 +12,8 @@ WORD: Final = "move"
 DONE: Final = "done"
 # The word by which the operator accepts something that was not tried before.
 GO_ON: Final = "continue"
+# The end of a sentence that ends the commissioning: the report is written after each stage.
+KEPT: Final = "What is measured so far is kept; run it again to continue"
 # Answers that end the commissioning at once, an empty line among them.
 _NO: Final = ("", "no")
 # Wrong answers until the commissioning ends.
@@ -69,18 +70,19 @@ class Operator:
             if answer := self.ask(question):
                 return answer
             self.say("Nothing was typed.")
-        raise UserError(f"nothing was typed: {question}")
+        raise UserError(f"nothing was typed: {question.removesuffix(':')}. {KEPT}")
 
     def number(self, question: str, low: float, high: float, played: Played | None = None) -> float:
         """Return a number within a range; raises UserError after some other answers."""
         for _ in range(_MAX_TRIES):
             answer = self.ask(f"{question} ({low:g} to {high:g}):", played)
-            with contextlib.suppress(ValueError):
-                if low <= (value := float(answer)) <= high:
-                    self._do(played, value)
-                    return value
-            self.say(f"{answer!r} is no number from {low:g} to {high:g}.")
-        raise UserError(f"no number from {low:g} to {high:g} was given: {question}")
+            if (value := _number(answer)) is not None and low <= value <= high:
+                self._do(played, value)
+                return value
+            with_point = answer.replace(",", ".")
+            cure = f": write {with_point}" if "," in answer and _number(with_point) is not None else ""
+            self.say(f"{answer!r} is no number from {low:g} to {high:g}{cure}.")
+        raise UserError(f"no number from {low:g} to {high:g} was given: {question}. {KEPT}")
 
     def choose(self, question: str, choices: Sequence[str], played: Played | None = None) -> str:
         """Return the chosen word; raises UserError after some other answers."""
@@ -89,7 +91,7 @@ class Operator:
             if answer in choices:
                 return answer
             self.say(f"{answer!r} is not {' or '.join(f'`{choice}`' for choice in choices)}.")
-        raise UserError(f"neither {' nor '.join(choices)} was given: {question}")
+        raise UserError(f"neither {' nor '.join(choices)} was given: {question.removesuffix(':')}. {KEPT}")
 
     def allow(self, motion: str) -> None:
         """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError.
@@ -133,7 +135,7 @@ class Operator:
             if answer in _NO:
                 break
             self.say(f"{answer!r} is not `{word}`, so that nothing was done. `no` ends the commissioning here.")
-        raise DeclinedError(f"{declined.removesuffix('.')}. What is measured so far is kept; run it again to continue")
+        raise DeclinedError(f"{declined.removesuffix('.')}. {KEPT}")
 
     def _with_hint(self, question: str, played: Played | None) -> str:
         """Return the question with what the emulated devices do, if there are any, before its last character."""
@@ -146,3 +148,11 @@ class Operator:
             return
         for command in played.commands:
             self.play(command.format(f"{value:g}"))
+
+
+def _number(answer: str) -> float | None:
+    """Return the number that was typed, or None."""
+    try:
+        return float(answer)
+    except ValueError:
+        return None

@@ -7,19 +7,23 @@ import os
 import signal
 import socket
 import subprocess
+from typing import Any
 
 import pytest
 
 from shearloop.drivers.defaults import RTDE_PORT
 from shearloop.drivers.ur.messages import CommandReply
 from shearloop.drivers.ur.receiver import RtdeReceiver
+from shearloop.drivers.ur.script import UPPER
 from shearloop.errors import UserError
 from shearloop.tools.commission import mover
 from shearloop.tools.commission.failing_worker import ForgetfulReceiver, close_rtde
 from shearloop.tools.commission.mover import MoverProcess
 from shearloop.tools.commission.mover_process import Driver
+from shearloop.tools.commission.observer_process import ObserverProcess
 from tests.drivers.ur.robots import DELIVERED
 from tests.emulator_process import own_address
+from tests.running import DEADLINE_S
 
 HOST = own_address(6)
 WORKER, LATER_WORKER = 4_190_001, 4_190_002
@@ -54,6 +58,25 @@ def signals(monkeypatch) -> list[tuple[int, signal.Signals]]:
     monkeypatch.setattr(subprocess, "Popen", FakeProcess)
     assert mover.subprocess.Popen is FakeProcess
     return sent
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_ctrl_c_ends_the_processes_without_a_word_also_while_they_load(capfd, monkeypatch):
+    """The terminal sends it to each of them, at any time. The commissioning ends its observer by itself."""
+    started: list[subprocess.Popen[Any]] = []
+    popen = subprocess.Popen
+    monkeypatch.setattr(
+        subprocess, "Popen", lambda *words, **options: started.append(popen(*words, **options)) or started[-1]
+    )
+    with MoverProcess(DELIVERED):
+        started[0].send_signal(signal.SIGINT)
+        assert started[0].wait(DEADLINE_S) == 0
+    observer = ObserverProcess(HOST, 125.0, UPPER)
+    monkeypatch.setattr(observer, "wait_for", lambda *_: "a sample")
+    with observer:
+        started[1].send_signal(signal.SIGINT)
+    assert started[1].returncode == -signal.SIGKILL
+    assert capfd.readouterr() == ("", "")
 
 
 def test_a_worker_that_is_not_known_is_not_stopped(signals):

@@ -1,14 +1,17 @@
 """The questions to the person at the robot: a word allows, another one never does."""
 
 from contextlib import ExitStack, nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
+from shearloop.drivers.robotiq.models import MODELS
 from shearloop.errors import UserError
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.fingers import AskedGripper
 from shearloop.tools.commission.given_word import LONGEST_STANDSTILL_S, GivenWord
+from shearloop.tools.commission.gripper import measured_gauges
 from shearloop.tools.commission.operator import DONE, WORD, DeclinedError, Operator, Played
 
 QUESTIONS = {WORD: Operator.allow, DONE: Operator.act}
@@ -88,6 +91,35 @@ def test_a_choice_is_asked_for_again_until_it_is_one_of_the_words():
     operator, _ = answering(["3", "yes", "no"])
     with pytest.raises(UserError, match="neither clockwise nor counterclockwise was given"):
         operator.choose("Which way:", ("clockwise", "counterclockwise"))
+
+
+def test_a_decimal_comma_is_no_number_and_its_cure_is_named():
+    operator, said = answering(["10,5", "1,2,3", "10.5"])
+    assert operator.number("Its width in mm", 0.5, 85.0) == 10.5
+    assert said == ["'10,5' is no number from 0.5 to 85: write 10.5.", "'1,2,3' is no number from 0.5 to 85."]
+
+
+def test_each_refusal_says_that_what_was_measured_is_kept():
+    refused = {
+        "number": lambda operator: operator.number("Its width in mm", 0.5, 85.0),
+        "choice": lambda operator: operator.choose("Which way:", ("clockwise", "counterclockwise")),
+        "name": lambda operator: operator.word_of("Your name:"),
+    }
+    for ask in refused.values():
+        operator, _ = answering(["", "", ""])
+        with pytest.raises(UserError, match=r"[a-z]\. What is measured so far is kept; run it again to continue$"):
+            ask(operator)
+
+
+def test_a_gauge_that_was_measured_already_is_asked_for_again():
+    answers = ["10", "10", "30", "30", "30"]
+    operator, said = answering(answers)
+    operator = replace(operator, answer=lambda question: WORD if "MOTION" in question else answers.pop(0))
+    gripper = SimpleNamespace(model=MODELS["2F-85"], move=lambda _: SimpleNamespace(position_counts=100))
+    context = SimpleNamespace(operator=operator, counts=Counts(gauges=3))
+    assert measured_gauges(context, gripper) == [(100.0, 10.0), (100.0, 30.0), (100.0, 30.0)]
+    assert answers == []
+    assert ["10 mm was measured already" in said[0], "30 mm was measured already" in said[1]] == [True, True]
 
 
 def test_a_pose_that_changes_while_it_is_asked_for_is_asked_for_again():

@@ -80,6 +80,16 @@ def test_worker_processes_ignore_the_terminals_signals():
     assert list(ProcessExecutor(1).map(ignored_signals, None, [0])) == [{signal.SIGINT, signal.SIGHUP}]
 
 
+def held_signals(_: None, __: int) -> set[int]:
+    """Return which signals this process holds back, also while it was loaded."""
+    return signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_ctrl_c_does_not_reach_a_worker_process_that_loads():
+    assert list(ProcessExecutor(1).map(held_signals, None, [0])) == [{signal.SIGINT}]
+    assert signal.SIGINT not in held_signals(None, 0)
+
+
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])

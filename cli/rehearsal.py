@@ -107,7 +107,7 @@ class _DeviceReplacer:
         """Write the robot's settings of a file with a loopback address, and return them."""
         import yaml
 
-        from shearloop.daemon.rig import robot_settings, sentences_on_open_keys
+        from shearloop.daemon.rig import robot_settings, why_not_driven
         from shearloop.yaml_files import read_yaml
 
         settings = robot_settings(source)
@@ -117,7 +117,7 @@ class _DeviceReplacer:
         self._sentences.append(
             f"the robot at {settings.host} is played at {self._host}; its limits are those of {source}"
         )
-        self._sentences += sentences_on_open_keys(source, settings)
+        self._sentences += why_not_driven(self._config, settings)
         return replace(settings, host=self._host)
 
     def _rig(self, robot: "UrSettings", skin: list[str]) -> None:

@@ -246,7 +246,7 @@ class SkinConfig(ConfigModel):
 class GripperSocket(ConfigModel):
     """The gripper behind the URCap's socket."""
 
-    host: DeviceAddress = Field(description="the robot's address")
+    host: DeviceAddress = Field(description="the robot's address, as in its settings; else a real rig does not run")
     port: int = Field(URCAP_PORT, ge=1, le=65535, description="TCP port of the URCap")
 
 

@@ -35,13 +35,13 @@ from shearloop.daemon.wrench_zero import WrenchZero
 from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import LinkMonitor
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hosts import is_loopback_host
+from shearloop.drivers.hosts import is_loopback_host, one_spelling
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.drivers.ur.client import UrRobot, missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
-from shearloop.errors import UserError
+from shearloop.errors import Hint, UserError
 
 if TYPE_CHECKING:
     # Only a rig that records loads it.
@@ -98,7 +98,7 @@ def robot_settings(path: Path) -> UrSettings:
 def open_settings(config: DaemonConfig) -> UrSettings | None:
     """Return the settings to drive the configured robot with, None without one; raises as `configured_settings` does.
 
-    Raises UserError with a line for each part that a real robot needs and the settings leave open.
+    Raises UserError with a line for each reason why a real robot is not driven.
     """
     settings = configured_settings(config)
     if lines := why_not_driven(config, settings):
@@ -107,16 +107,32 @@ def open_settings(config: DaemonConfig) -> UrSettings | None:
 
 
 def why_not_driven(config: DaemonConfig, settings: UrSettings | None) -> list[str]:
-    """Return a sentence on each part that the settings of a configured robot leave open; none for an emulated one."""
+    """Return a sentence on each part that a configured robot's settings leave open, and on a gripper elsewhere.
+
+    None for an emulated robot.
+    """
     if config.robot is None or settings is None or config.emulated:
         return []
-    return sentences_on_open_keys(config.robot, settings)
-
-
-def sentences_on_open_keys(path: Path, settings: UrSettings) -> list[str]:
-    """Return a sentence on each part that the settings of a robot leave open; `path` is their file."""
+    found = [f"{part} is not filled in: {cure}" for part, cure in settings.left_open().items()]
+    if (elsewhere := gripper_elsewhere(config, settings)) is not None:
+        found.append(elsewhere.clause)
     stakes = "a real robot does not run before, a rehearsal (`--emulate`) does"
-    return [f"{path}: {part} is not filled in: {cure}; {stakes}" for part, cure in settings.left_open().items()]
+    return [f"{config.robot}: {reason}; {stakes}" for reason in found]
+
+
+def gripper_elsewhere(config: DaemonConfig, settings: UrSettings) -> Hint | None:
+    """Return that the gripper's socket is not at the address of a real robot, with the cure, or None.
+
+    The URCap's socket is on its robot's controller. At another address the fingers of another robot would move.
+    """
+    address = config.gripper_address
+    if address is None or config.emulated or one_spelling(address[0]) == one_spelling(settings.host):
+        return None
+    return Hint(
+        f"`host: {settings.host}` differs from the configuration's `gripper.socket.host: {address[0]}`; the URCap's "
+        "socket is on its robot's controller, and the fingers of another robot may move",
+        "correct the wrong one of the two",
+    )
 
 
 def configured_settings(config: DaemonConfig) -> UrSettings | None:

@@ -33,7 +33,8 @@ CheckEmulators = Callable[[tuple["EmulatorConfig", ...], Path], object]
 _MEMORY_DEVICES = 1
 
 
-# The part with what the robot's settings leave open, and the one with calibrations on emulated devices.
+# The part with what the robot's settings leave open and a gripper elsewhere, and the one with calibrations on emulated
+# devices.
 OPEN_KEYS, EMULATED_CALIBRATIONS = "robot's settings", "calibrations"
 # What only a run with the real devices is refused for: a rehearsal runs.
 OF_REAL_DEVICES = (OPEN_KEYS, EMULATED_CALIBRATIONS)

@@ -149,7 +149,7 @@ async def test_fingertip_names_do_not_collide_with_task_names(config, tmp_path):
     (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
         robot="ur.yaml",
-        gripper={"model": "2F-140", "socket": {"host": "127.0.0.1"}},
+        gripper={"model": "2F-140", "socket": {"host": "192.168.1.10"}},
         load_cell={"device": {"path": "load"}},
         experiment="wait.yaml",
         recording={"folder": "recordings"},

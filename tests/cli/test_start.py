@@ -26,7 +26,9 @@ from shearloop.daemon.rig import open_settings
 from shearloop.drivers.hosts import is_loopback_host
 from shearloop.estimation import fit
 from shearloop.estimation.skin.calibration import load_calibration
+from shearloop.tools.doctor import check_gripper_address
 from tests.estimation.conftest import twisting
+from tests.fixtures.daemons import robot_at
 from tests.fixtures.robots import write_filled_in
 
 CONFIG = Path(__file__).parents[2] / "config"
@@ -169,6 +171,32 @@ def test_the_parts_of_the_robot_that_are_commented_out_count_only_with_ones_own_
 def test_a_robot_that_is_filled_in_is_in_order(untouched, ran):
     write_filled_in(untouched.parent)
     assert "is in order" in ran("check", untouched).out
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_gripper_that_is_not_at_its_robots_address_is_refused_and_a_rehearsal_says_so(untouched, ran):
+    robot = write_filled_in(untouched.parent, host="10.20.3.14")
+    text = untouched.read_text()
+    untouched.write_text(text.replace("{host: 192.168.1.10}", "{host: 10.20.3.41}"))
+    why = f"{robot}: `host: 10.20.3.14` differs from the configuration's `gripper.socket.host: 10.20.3.41`; "
+    assert ran("run", untouched, status=2).err.startswith(f"shearloop run: {why}")
+    assert why in ran("commission", untouched, "--out", untouched.with_name("report.yaml"), status=2).err
+    said = ran("check", untouched).out
+    assert why in said
+    assert "in order for a rehearsal (`shearloop run --emulate`); the real devices need the changes above" in said
+    config = load_daemon_config(untouched)
+    (finding,) = check_gripper_address(config)
+    assert finding.state == "trouble"
+    with rehearsal(config, untouched) as rehearsed:
+        assert any(sentence.startswith(why) for sentence in rehearsed.sentences)
+        assert open_settings(rehearsed.config) is not None
+    # Another spelling of the same address, and what another process plays.
+    untouched.write_text(text.replace("{host: 192.168.1.10}", '{host: "::ffff:10.20.3.14"}'))
+    assert open_settings(load_daemon_config(untouched)) is not None
+    robot_at("127.0.0.1", untouched.parent)
+    emulated = {"emulated": True, "gripper": {"model": "2F-140", "socket": {"host": "127.0.0.2"}}, "robot": "ur.yaml"}
+    untouched.write_text(yaml.safe_dump({**emulated, "load_cell": {"device": {"path": "load"}}}))
+    assert open_settings(load_daemon_config(untouched)) is not None
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -16,7 +16,7 @@ from shearloop.bank.errors import BankError
 from shearloop.daemon.config import CurveConfig, DaemonConfig, FingertipConfig, GripperConfig, load_daemon_config
 from shearloop.daemon.motion_cap import knows_tool
 from shearloop.daemon.report_in_use import commissioning_of
-from shearloop.daemon.rig import configured_settings
+from shearloop.daemon.rig import configured_settings, gripper_elsewhere
 from shearloop.daemon.running_rig import EMULATED
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import missing_library
@@ -90,6 +90,7 @@ def examine(
         yield from check_robot_values(config.robot)
         yield from check_cap(config)
     if config.gripper is not None and not config.emulated:
+        yield from check_gripper_address(config)
         yield from check_gripper_model(config, config.gripper)
     yield from check_daemon_and_devices(config, config_path, seconds)
 
@@ -250,6 +251,17 @@ def check_cap(config: DaemonConfig) -> Iterator[Finding]:
     else:
         cap = commissioning.cap
         yield note("commissioning", cap.cause, "an experiment that asks for more is refused", cap.cure)
+
+
+def check_gripper_address(config: DaemonConfig) -> Iterator[Finding]:
+    """Name a gripper whose socket is not at its robot's address."""
+    try:
+        settings = configured_settings(config)
+    except (DriverError, UserError):
+        # The mistakes are among the findings on files.
+        return
+    if settings is not None and (elsewhere := gripper_elsewhere(config, settings)) is not None:
+        yield trouble("gripper's address", elsewhere.cause, "the daemon does not start", elsewhere.cure)
 
 
 def check_gripper_model(config: DaemonConfig, gripper: GripperConfig) -> Iterator[Finding]:

@@ -133,13 +133,8 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     if not all(map(math.isfinite, measured)):
         return "The controller reports values that are no numbers."
     limits = settings.limits
-    joints, box = limits.joints, limits.box
-    for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
-        if not low <= q <= high:
-            return f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad."
-    for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
-        if not low <= value <= high:
-            return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
+    if (place := beyond_its_place(sample, limits)) is not None:
+        return place.sentence
     speeds = [
         (f"joint {number} speed" if number <= WRIST else "wrist speed", abs(qd), limits.wrist_speed_rad_per_s, "rad/s")
         for number, qd in enumerate(sample.qd_rad_per_s, 1)
@@ -150,6 +145,21 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
             return beyond
     found = slowed_by(sample) or tool_difference(sample, settings.tool)
     return found.sentence if found is not None else ""
+
+
+def beyond_its_place(sample: RtdeOutputs, limits: UrLimits) -> Hint | None:
+    """Return which joint is beyond its range, or that the tool is beyond the workspace, and the cure; or None."""
+    joints, box = limits.joints, limits.box
+    cure = "move the arm back with freedrive at the teach pendant, or correct `limits.{}` in the robot's settings"
+    for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
+        if not low <= q <= high:
+            cause = f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad"
+            return Hint(cause, cure.format("joints"))
+    for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
+        if not low <= value <= high:
+            cause = f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m"
+            return Hint(cause, cure.format("workspace"))
+    return None
 
 
 def slowed_by(sample: RtdeOutputs) -> Hint | None:

@@ -25,12 +25,12 @@ from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.shear_skin.instruments import PolledInstrument
 from shearloop.drivers.ur.control_box import ControllerInfo, check_generation, check_ports, query_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
-from shearloop.drivers.ur.limits import slowed_by, tool_difference
-from shearloop.drivers.ur.messages import RobotLostError
+from shearloop.drivers.ur.limits import beyond_its_place, slowed_by, tool_difference
+from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.ports import FIELDBUS_MENU
 from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.script import UPPER
-from shearloop.drivers.ur.settings import UrSettings, read_settings
+from shearloop.drivers.ur.settings import UrLimits, UrSettings, read_settings
 from shearloop.errors import UserError
 from shearloop.tools.arm_models import Arm, read_arm
 from shearloop.tools.doctor.boards import (
@@ -161,20 +161,23 @@ def _check_robot(config: DaemonConfig, path: Path) -> Iterator[Finding]:
 
 
 def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Finding]:
-    """Judge slider, payload and tool at the pendant, as the daemon does before each motion."""
+    """Judge slider, place of the arm, payload and tool, as the daemon does before each motion."""
     host, means = settings.host, "the daemon refuses every motion"
     try:
         outputs = read_outputs(host, ROBOT_TIMEOUT_S, seen.registers or UPPER)
         arm = read_arm(host, ROBOT_TIMEOUT_S, settings.facts.major)
     except DriverError as error:
         cure = "look at the teach pendant, and run the doctor again"
-        yield from_error("robot's state", error, "slider, payload and tool are not known", cure)
+        yield from_error("robot's state", error, "slider, place of the arm, payload and tool are not known", cure)
         return
     slowed, differs = slowed_by(outputs), tool_difference(outputs, settings.tool)
     if slowed is not None:
         yield trouble("speed slider", slowed.cause, means, slowed.cure)
     else:
         yield good("speed slider", f"{outputs.speed_slider:.0%}")
+    # The findings on the robot's settings name a workspace that is absent.
+    if settings.limits.workspace is not None:
+        yield check_place(outputs, settings.limits)
     if differs is not None:
         yield trouble("payload and tool", differs.cause, means, differs.cure)
         return
@@ -186,6 +189,14 @@ def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Findi
         return
     else:
         yield good("payload and tool", "as in the robot's settings")
+
+
+def check_place(outputs: RtdeOutputs, limits: UrLimits) -> Finding:
+    """Judge whether the arm stands within the workspace and the ranges of its joints."""
+    subject, place = "place of the arm", beyond_its_place(outputs, limits)
+    if place is None:
+        return good(subject, "inside the workspace and the joints' ranges")
+    return trouble(subject, place.cause, "the daemon refuses every motion", place.cure)
 
 
 def check_payload(arm: Arm, *payloads_kg: float | None) -> Finding | None:

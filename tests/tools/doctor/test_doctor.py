@@ -3,7 +3,7 @@
 import asyncio
 import json
 import os
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +27,7 @@ from shearloop.tools.doctor.boards import check_port
 from shearloop.tools.doctor.devices import check_task
 from shearloop.tools.doctor.findings import from_error
 from shearloop.tools.serial_ports import HiddenBoard, SerialPortInfo, access_cure, has_brltty, list_hidden_boards
+from tests.drivers.ur.handler_bench import AT_REST, LIMITS
 from tests.emulator_process import own_address
 from tests.fixtures.daemons import DEADLINE_S, robot_at, shearloop
 
@@ -112,6 +113,22 @@ def test_a_payload_is_judged_by_the_arms_that_a_model_may_be(payloads_kg, state)
     assert state != "note" or "type plate" in found.next_step
 
 
+@pytest.mark.parametrize(
+    ("changes", "limit"),
+    [
+        ({}, ""),
+        ({"tcp_pose": (-0.5, -0.1, -0.3, 0.0, 0.0, 0.0)}, "workspace"),
+        ({"q_rad": (0.0, 0.0, 0.0, 0.0, 0.0, 99.0)}, "joints"),
+    ],
+)
+def test_an_arm_outside_its_workspace_or_its_ranges_is_named_with_the_way_back(changes, limit):
+    found = devices.check_place(replace(AT_REST, **changes), LIMITS)
+    assert found.state == ("trouble" if limit else "good")
+    if limit:
+        assert "freedrive" in found.next_step
+        assert f"correct `limits.{limit}`" in found.next_step
+
+
 async def test_a_daemon_that_hangs_is_not_taken_for_none(rig_config, monkeypatch):
     monkeypatch.setattr(devices, "send_to_stop_socket", Mock(side_effect=TimeoutError))
     found = await examined(rig_config, 0.1)
@@ -138,7 +155,8 @@ async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config, tiny_
         # The board sends more often than the configuration says.
         assert found["rate of load_cell"].state == "note"
         assert "5 Hz configured" in found["rate of load_cell"].found
-        assert (found["speed slider"].state, found["payload and tool"].state) == ("good", "good")
+        for subject in ("speed slider", "place of the arm", "payload and tool"):
+            assert found[subject].state == "good", found[subject]
         rig.stdin.write(b"slider 0.5\npayload 2\n")
         assert b"obeyed" in await rig.stdout.readline()
         assert b"obeyed" in await rig.stdout.readline()

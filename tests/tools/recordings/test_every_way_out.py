@@ -354,7 +354,7 @@ def test_every_export_gives_back_a_recording_with_absent_devices(config, tmp_pat
     path = config(
         load_cell={"device": {"path": "no-load-cell"}},
         robot="ur.yaml",
-        gripper={"model": "2F-140", "socket": {"host": "127.0.0.1", "port": free_port()}},
+        gripper={"model": "2F-140", "socket": {"host": own_address(5), "port": free_port()}},
         recording={"folder": str(tmp_path / "recordings")},
     )
     published = asyncio.run(absent(path))

@@ -28,6 +28,8 @@ def refuse_second_daemon(commands: str, page: str = "", cure: str = OTHER_ADDRES
     shown = f", its page is {page}" if page else ""
     raise UserError(
         f"a daemon runs already at {commands}: {whose_daemon(reply)}{shown}; "
-        f"`shearloop command stop --connect {commands}` stops its experiment, and a "
-        f"second time ends it{f'. To run beside it, {cure}' if cure else ''}"
+        f"`shearloop command stop --connect {commands}` stops its experiment, and a second time ends it. While its "
+        f"gripper holds a tool, or may hold one, open the fingers first with `shearloop command release --connect "
+        f"{commands}`, or end it with Ctrl-C in its terminal or `systemctl stop shearloop`"
+        f"{f'. To run beside it, {cure}' if cure else ''}"
     )

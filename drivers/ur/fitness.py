@@ -36,8 +36,8 @@ def why_unfit(sample: RtdeSample, settings: UrSettings) -> str:
         return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
     if sample.emergency_stop:
         return (
-            "Emergency stop: make the cell safe, release the button, keep hands out of the gripper, then unlock: a "
-            "gripper that lost its power opens and closes its fingers once."
+            "Emergency stop: make the cell safe, release the button, then unlock. Keep hands out of the gripper: where "
+            "it lost its power, the next release opens and closes its fingers once before it opens them."
         )
     if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
         other = f"The robot's safety system is in the mode “{sample.safety_mode_name}”: look at the teach pendant."

@@ -35,7 +35,8 @@ def answering(monkeypatch, reply):
 
 def test_a_second_demo_is_refused_by_name(monkeypatch):
     answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
-    with pytest.raises(UserError, match=rf"{NAMED}.*`shearloop command stop --connect"):
+    first = r"or may hold one, open the fingers first with `shearloop command release --connect"
+    with pytest.raises(UserError, match=rf"{NAMED}.*`shearloop command stop --connect.*{first}"):
         demo.check_ports(DaemonConfig(load_cell={"device": {"path": "load"}}), Path("my/config/demo.yaml"))
 
 

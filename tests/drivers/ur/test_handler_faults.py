@@ -230,7 +230,7 @@ def test_recovery_from_an_emergency_stop_needs_the_button_released():
     bench.arm.be(safety_mode=7, robot_mode=3)
     bench.run(10)
     assert bench.state.emergency_stop
-    assert "opens and closes its fingers" in bench.state.blocked
+    assert "the next release opens and closes its fingers once" in bench.state.blocked
     assert "still pressed" in bench.ask(Unlock()).refusal
     bench.arm.be(safety_mode=1)
     bench.run(10)

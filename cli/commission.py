@@ -2,6 +2,7 @@
 
 import argparse
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -54,7 +55,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.cli.terminal import print_result
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.motion_cap import naming
     from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
@@ -89,10 +89,24 @@ def run(args: argparse.Namespace) -> int:
         if settings is not None:
             named = config.model_copy(update={"commissioned": args.out})
             if allowed := commissioning_of(named, settings).sentence:
-                given = naming(str(args.out.resolve()), rehearsed=args.emulate)
-                sentences.append(f"{label}With {given}, {allowed}.")
+                sentences.append(f"{label}With {naming(args.out, args.config, rehearsed=args.emulate)}, {allowed}.")
     print_result(report.model_dump(mode="json", exclude_none=True), sentences, as_json=args.json)
     return 0 if report.passed else 1
+
+
+def naming(report: Path, config: Path, *, rehearsed: bool) -> str:
+    """Return what gives a report to the daemon; its path counts from the configuration's folder.
+
+    A real rig's configuration would refuse a report of emulated devices.
+    """
+    import yaml
+
+    report, folder = report.resolve(), config.resolve().parent
+    path = str(report.relative_to(folder) if report.is_relative_to(folder) else report)
+    if rehearsed:
+        return f"`--set {shlex.quote(f'commissioned={path}')}`"
+    line = yaml.safe_dump({"commissioned": path}, width=sys.maxsize, allow_unicode=True).strip()
+    return f"the line `{line}` in {config}"
 
 
 @contextmanager

@@ -31,17 +31,17 @@ _SPEED_NEEDS: Final = "0134"
 _TORQUE_NEEDS: Final = "01357"
 
 
-def naming(file: str, *, rehearsed: bool) -> str:
-    """Return what gives a report to the daemon; a real rig's configuration would refuse one of emulated devices."""
-    return f"`--set commissioned={file}`" if rehearsed else f"`commissioned: {file}`"
-
-
 def new_report(file: str = "NEW_FILE", *, rehearsed: bool = False) -> str:
     """Return the cure where no report can be continued; in a rehearsal one of emulated devices helps."""
-    named = naming(file, rehearsed=rehearsed)
     if rehearsed:
-        return f"run `shearloop commission CONFIG --out {file} --emulate`, then rehearse with {named}"
-    return f"run `shearloop commission CONFIG --out {file}`, then write {named} into the configuration"
+        return (
+            f"run `shearloop commission CONFIG --out {file} --emulate`, then rehearse with the option `--set "
+            "commissioned=…` that it prints at its end"
+        )
+    return (
+        f"run `shearloop commission CONFIG --out {file}`, then write the line `commissioned: …` that it prints at its "
+        "end into the configuration"
+    )
 
 
 @dataclass(frozen=True, slots=True)

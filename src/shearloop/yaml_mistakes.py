@@ -35,19 +35,26 @@ def syntax(error: yaml.MarkedYAMLError) -> str:
 
 
 def meant(path: Path, model: type[Any] | None) -> str:
-    """Return which YAML file was probably meant by the path of a folder, or of no file; empty where none is near."""
+    """Return which YAML file was probably meant by the path of a folder, or of no file; empty where none is near.
+
+    A path in a file counts from this file's folder. Where it was written as the shell has it, the folder stands twice
+    in it, and the file of this name is above.
+    """
     folder = path if path.is_dir() else path.parent
     try:
         names = sorted(one.name for one in folder.iterdir() if one.suffix in _SUFFIXES)
     except OSError:
-        return ""
+        names = []
     if folder is path:
         # A folder of `init` has its configuration under this name.
         near = ["rig.yaml"] if "rig.yaml" in names else names
     else:
         near = get_close_matches(path.name, [name for name in names if name != path.name], _LOOKED_AT)
-    near = [name for name in near[:_LOOKED_AT] if model is None or _may_be(folder / name, model)]
-    return f"; did you mean {folder / near[0]}?" if near else ""
+    found = [folder / name for name in near[:_LOOKED_AT]]
+    if folder is not path:
+        found += [above for parent in folder.parents if (above := parent / path.name).is_file()]
+    found = [one for one in found if model is None or _may_be(one, model)]
+    return f"; did you mean {found[0]}?" if found else ""
 
 
 def _may_be(path: Path, model: type[Any]) -> bool:

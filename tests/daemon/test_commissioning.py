@@ -211,7 +211,10 @@ def test_a_stage_without_a_number_is_refused(tmp_path, name):
         load_report(path)
 
 
-NEW = "run `shearloop commission CONFIG --out NEW_FILE`, then write `commissioned: NEW_FILE` into the configuration"
+NEW = (
+    "run `shearloop commission CONFIG --out NEW_FILE`, then write the line `commissioned: …` that it prints at its end "
+    "into the configuration"
+)
 AGAIN = "run `shearloop commission CONFIG --out FILE"
 
 
@@ -270,7 +273,8 @@ def test_a_rehearsal_has_the_cap_of_the_rig_that_it_plays(tmp_path):
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
     assert found.settings.limits.wrist_speed_rad_per_s.inner == CAPPED_RAD_PER_S
     assert found.cap.cure == (
-        "run `shearloop commission CONFIG --out FILE --emulate`, then rehearse with `--set commissioned=FILE`"
+        "run `shearloop commission CONFIG --out FILE --emulate`, then rehearse with the option `--set commissioned=…` "
+        "that it prints at its end"
     )
 
 
@@ -300,7 +304,9 @@ def test_an_emulated_rig_takes_no_controller_but_an_emulated_one(tmp_path, rehea
 def test_a_rehearsal_of_another_rig_is_not_raised(tmp_path):
     report = changed(report_of(write_rig(tmp_path), "013457", SUPPLIED), emulated=True)
     found = rehearsing(tmp_path, report, wrist=0.7)
-    assert found.cap.cure.endswith("--out NEW_FILE --emulate`, then rehearse with `--set commissioned=NEW_FILE`")
+    assert found.cap.cure.endswith(
+        "--out NEW_FILE --emulate`, then rehearse with the option `--set commissioned=…` that it prints at its end"
+    )
     assert "the robot's settings changed" in found.cap.why
     assert caps(found) == (CAPPED_RAD_PER_S, CAPPED_M_PER_S, CAPPED_NM)
 
@@ -647,6 +653,14 @@ def test_doctor_compares_the_controller_with_settings_and_report(tmp_path):
 def test_a_missing_report_is_a_mistake_of_the_configuration(tmp_path):
     config = load_daemon_config(write_rig(tmp_path, commissioned="absent.yaml"))
     with pytest.raises(UserError, match=r"absent\.yaml.*shearloop commission"):
+        commissioning_of(config, read_settings(config.robot), NOW)
+
+
+def test_a_report_that_is_named_from_the_shells_folder_is_found_beside_the_configuration(tmp_path):
+    report = report_of(write_rig(tmp_path), "0")
+    save_report(tmp_path / "report.yaml", report)
+    config = load_daemon_config(write_rig(tmp_path, commissioned="my-rig/report.yaml"))
+    with pytest.raises(UserError, match=f"did you mean {tmp_path / 'report.yaml'}[?]"):
         commissioning_of(config, read_settings(config.robot), NOW)
 
 

@@ -15,6 +15,7 @@ import pytest
 import yaml
 
 from shearloop.cli import main, other_daemon
+from shearloop.cli.commission import naming
 from shearloop.daemon.commissioning_report import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.refusals import Refusals
@@ -271,6 +272,24 @@ def test_stage_0_is_run_on_an_emulated_controller_with_scripted_answers(tmp_path
         robot.close()
 
 
+@pytest.mark.parametrize(
+    ("out", "line"),
+    [
+        ("my-rig/report.yaml", "the line `commissioned: report.yaml` in my-rig/rig.yaml"),
+        ("my-rig/reports/1: new.yaml", "the line `commissioned: 'reports/1: new.yaml'` in my-rig/rig.yaml"),
+        ("report.yaml", "the line `commissioned: {}/report.yaml` in my-rig/rig.yaml"),
+    ],
+)
+def test_the_line_that_names_the_report_is_as_the_configuration_needs_it(tmp_path, monkeypatch, out, line):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my-rig").mkdir()
+    path = write_rig(tmp_path / "my-rig")
+    named = naming(Path(out), path.relative_to(tmp_path), rehearsed=False)
+    assert named == line.format(tmp_path)
+    path.write_text(path.read_text() + named.split("`")[1] + "\n")
+    assert load_daemon_config(path).commissioned == tmp_path / out
+
+
 @pytest.mark.usefixtures("ur_rtde")
 def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so(tmp_path, monkeypatch, capsys):
     path, out = write_rig(tmp_path), tmp_path / "emulated.yaml"
@@ -281,7 +300,10 @@ def test_a_commissioning_is_rehearsed_on_emulated_devices_and_every_line_says_so
     assert any(f"[emulated: the pendant shows {EMULATED_CHECKSUM}]:" in line for line in lines)
     assert [line for line in lines if not line.startswith("EMULATED: ")] == []
     # The real rig would refuse this report in its configuration.
-    assert f"With `--set commissioned={out}`, the robot is capped at 0.2 rad/s, 0.05 m/s and 0.3 N·m: its" in lines[-1]
+    assert (
+        "With `--set commissioned=emulated.yaml`, the robot is capped at 0.2 rad/s, 0.05 m/s and 0.3 N·m: its"
+        in lines[-1]
+    )
     rig = yaml.safe_load(out.read_text())["rig"]
     assert (rig["emulated"], rig["robot_serial_number"]) == (True, "EMULATED")
     page = out.with_suffix(".html").read_text()

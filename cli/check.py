@@ -10,7 +10,11 @@ from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
+    from shearloop.daemon.config import DaemonConfig
     from shearloop.tools.check import Parts
+
+# The part that says why a rehearsal is refused.
+REHEARSAL = "rehearsal"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +58,19 @@ def run(args: argparse.Namespace) -> int:
     if for_real:
         rehearsal = "a rehearsal (`shearloop run --emulate`)" if args.rig is None else f"a rehearsal of {args.rig}"
         verdict = f"{for_real}\n{verdict} for {rehearsal}; the real devices need the changes above"
+        if REHEARSAL in parts.texts:
+            verdict = f"{for_real}\n{args.config} needs the changes above, and cannot be rehearsed"
     return print_result(result, [*sentences, verdict], as_json=args.json)
+
+
+def _note_reach(config: "DaemonConfig", parts: "Parts") -> None:
+    """Say that a rehearsal is refused whose emulated arm does not reach the workspace; the real arm may be larger."""
+    from shearloop.cli.rehearsal import refuse_workspace_out_of_reach
+
+    try:
+        refuse_workspace_out_of_reach(config)
+    except UserError as error:
+        parts.texts[REHEARSAL] = f"refused: {error}"
 
 
 def _is_experiment(content: object) -> bool:
@@ -80,7 +96,9 @@ def _check_configuration(path: Path) -> "Parts":
 
     parts = Parts()
     with parts.of("configuration"):
-        parts = check_parts(load_daemon_config(path), path, check_emulators)
+        config = load_daemon_config(path)
+        parts = check_parts(config, path, check_emulators)
+        _note_reach(config, parts)
     if "configuration" in parts.mistakes:
         with parts.of("experiment"):
             _check_named_experiment(path)
@@ -98,7 +116,9 @@ def _check_experiment(path: Path, rig: Path | None) -> "Parts":
     config = load_daemon_config(rig)
     if config.robot is None:
         raise UserError(f"{rig}: an experiment needs a robot: add `robot: ur.yaml`")
-    return check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
+    parts = check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
+    _note_reach(config, parts)
+    return parts
 
 
 def _check_named_experiment(path: Path) -> None:

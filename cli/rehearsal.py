@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,18 @@ def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
         raise UserError(f"{path} is emulated already: run it without --emulate")
     with run_folder() as folder:
         yield _DeviceReplacer(config, path, folder).rehearsal()
+
+
+def refuse_workspace_out_of_reach(config: "DaemonConfig") -> None:
+    """Raise UserError if the emulated arm cannot stand in the workspace of a configured robot with valid settings."""
+    from shearloop.drivers.errors import DriverError
+    from shearloop.drivers.ur.settings import read_settings
+
+    if config.robot is None or config.emulated:
+        return
+    # The mistakes in the settings are told elsewhere.
+    with contextlib.suppress(DriverError):
+        _robot_arguments(read_settings(config.robot))
 
 
 def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
@@ -237,10 +249,13 @@ def _robot_arguments(robot: "UrSettings") -> list[str]:
         offset,
     )
     if joints_rad is None:
-        box = asdict(limits.box)
+        box = ", ".join(
+            f"{axis} from {low:g} to {high:g} m"
+            for axis, low, high in zip("xyz", limits.box.lower_m, limits.box.upper_m, strict=True)
+        )
         raise UserError(
-            f"the emulated arm reaches no point in the middle of the workspace with its tool downwards: {box}; "
-            "check `limits.workspace` and `limits.joints` of the robot's settings"
+            "the emulated arm, a UR5e, reaches no point in the middle of the workspace with its tool downwards: "
+            f"{box}; check `limits.workspace` and `limits.joints` of the robot's settings"
         )
     arguments = ["--rate-hz", EMULATED_RATE_HZ, "--joints-rad", *(f"{angle:.6f}" for angle in joints_rad)]
     arguments += ["--tcp-offset", *map(str, offset)]

@@ -29,7 +29,7 @@ from shearloop.estimation.skin.calibration import load_calibration
 from shearloop.tools.doctor import check_gripper_address
 from tests.estimation.conftest import twisting
 from tests.fixtures.daemons import robot_at
-from tests.fixtures.robots import write_filled_in
+from tests.fixtures.robots import TOOL, write_filled_in
 
 CONFIG = Path(__file__).parents[2] / "config"
 # A calibration is written by a command, not by people.
@@ -197,6 +197,20 @@ def test_a_gripper_that_is_not_at_its_robots_address_is_refused_and_a_rehearsal_
     emulated = {"emulated": True, "gripper": {"model": "2F-140", "socket": {"host": "127.0.0.2"}}, "robot": "ur.yaml"}
     untouched.write_text(yaml.safe_dump({**emulated, "load_cell": {"device": {"path": "load"}}}))
     assert open_settings(load_daemon_config(untouched)) is not None
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("tool", [TOOL, {}])
+def test_a_workspace_that_the_emulated_arm_does_not_reach_is_named_in_words(tool, untouched, ran):
+    robot = yaml.safe_load(write_filled_in(untouched.parent, tool=tool).read_text())
+    robot["limits"]["workspace"] = {"lower_m": [1.3, 1.2, 0.1], "upper_m": [1.8, 1.7, 0.5], "margin_m": 0.02}
+    untouched.with_name("ur.yaml").write_text(yaml.safe_dump(robot))
+    said = ran("check", untouched).out
+    box = "x from 1.3 to 1.8 m, y from 1.2 to 1.7 m, z from 0.1 to 0.5 m; check `limits.workspace`"
+    assert "\nrehearsal: refused: the emulated arm, a UR5e, reaches no point" in said
+    assert box in said
+    assert "in order for a rehearsal" not in said
+    assert box in ran("run", untouched, "--emulate", status=2).err
 
 
 @pytest.mark.usefixtures("ur_rtde")

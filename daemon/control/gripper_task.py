@@ -165,6 +165,8 @@ class GripperTask:
             raise NotBegunError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate(operator_confirmed=True)
+        # An activation leaves the fingers open. Only a motion shows the gripper whether they hold something.
+        await self.grip(OPENING)
 
     @property
     def is_holding(self) -> bool | None:

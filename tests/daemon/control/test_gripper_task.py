@@ -359,7 +359,9 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way, tmp_pat
             await task.unlock()
         assert rig.model.width_mm == held_mm
         await task.unlock(confirmed=True)
-        assert not (await rig.driver.read()).fault.needs_activation
+        state = await rig.driver.read()
+        assert not state.fault.needs_activation
+        assert not task.status_of(state).may_hold, "open fingers are empty after an activation"
 
 
 @WAYS

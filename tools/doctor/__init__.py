@@ -31,7 +31,7 @@ from shearloop.tools.doctor.devices import (
     listen_for_frames,
 )
 from shearloop.tools.doctor.findings import Finding, from_error, from_file, good, note, trouble
-from shearloop.tools.doctor.robot_values import check_robot_values
+from shearloop.tools.doctor.robot_values import check_example_addresses, check_robot_values
 from shearloop.tools.running_daemon import whose_daemon
 from shearloop.tools.serial_ports import HiddenBoard, has_brltty, list_hidden_boards, list_serial_ports
 from shearloop.yaml_files import read_yaml
@@ -86,6 +86,8 @@ def examine(
         yield good(EMULATED, "every device of this configuration is emulated: nothing here is said of real ones")
     yield check_disk(Path()) if config.recording is None else check_recording(config.recording.folder)
     yield from check_files(config, config_path, check_emulators, own)
+    if not config.emulated:
+        yield from check_example_addresses(config)
     if config.robot is not None and not config.emulated:
         yield from check_robot_values(config.robot)
         yield from check_cap(config)

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import yaml
 
-from shearloop.tools.doctor.robot_values import check_robot_values
+from shearloop.daemon.config import load_daemon_config
+from shearloop.tools.doctor.robot_values import check_example_addresses, check_robot_values
 from tests.fixtures.robots import TOOL, filled_in, write_filled_in
 
 INITIAL = [
@@ -63,6 +64,26 @@ def changed(limit: str, **parts: Any) -> dict[str, Any]:
 )
 def test_a_limit_that_somebody_has_changed_is_not_named(limits, named, tmp_path):
     assert named_limits(write_filled_in(tmp_path, limits=limits)) == named
+
+
+def test_the_example_addresses_of_init_are_named_until_each_is_ones_own(tmp_path):
+    path = tmp_path / "rig.yaml"
+    content = yaml.safe_load(Path("config/rig.yaml").read_text())
+    content["fingertips"]["right"]["device"] = {"serial_number": "85734323"}
+    path.write_text(yaml.safe_dump(content))
+    write_filled_in(tmp_path)
+    (finding,) = check_example_addresses(load_daemon_config(path))
+    assert finding.state == "note"
+    assert finding.found == (
+        "as `init` wrote them: `fingertips.left.device` 12345671, `load_cell.device` 12345672, "
+        "`gripper.socket` 192.168.1.10:63352, `robot` 192.168.1.10"
+    )
+    content["fingertips"]["left"]["device"] = {"path": "/dev/ttyACM3"}
+    del content["load_cell"]
+    content["gripper"]["socket"] = {"host": "10.20.3.14"}
+    path.write_text(yaml.safe_dump(content))
+    write_filled_in(tmp_path, host="10.20.3.14")
+    assert list(check_example_addresses(load_daemon_config(path))) == []
 
 
 def test_nothing_is_said_once_every_limit_is_ones_own(tmp_path):

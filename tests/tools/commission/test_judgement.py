@@ -108,6 +108,13 @@ def test_a_clock_that_loses_cycles_fails(rate, lines):
     assert failed([judge_clock(seen)]) == lines
 
 
+def test_a_clock_of_which_no_state_came_is_not_measured_and_not_one_that_stands():
+    line = judge_clock([])
+    assert line.verdict == "failed"
+    assert line.count == 0
+    assert "not measured: 0 states" in line.value
+
+
 @pytest.mark.parametrize(("sigma", "lines"), [(0.0005, []), (0.003, ["velocity noise at rest"])])
 def test_noise_that_looks_like_motion_fails(sigma, lines):
     seen = [

@@ -54,8 +54,8 @@ demo: demo-python $(VENV)/.installed
 #   Tests that only compute run beside both. The scheduler gives them what time the others leave of the cores, and takes
 #   it away at once (SCHED_IDLE). On a busy computer they get little time, so that their timeout is long.
 # Status 5: no test was selected.
-# `make test` takes four to six minutes. `make test-long` runs what takes half as long again: endurance, a newcomer's first hour, and
-# figures (LONG in tests/conftest.py). `.ci/run` calls both.
+# `make test` takes about five minutes, and `make test-long` nearly as long: endurance, a newcomer's first hour, each seeded
+# fault of commissioning, and figures (LONG in tests/conftest.py, and `pytest.mark.long`). `.ci/run` calls both.
 PYTEST := $(BIN)/pytest --dist loadfile --no-loadscope-reorder
 LENGTH := not long
 # Not every container allows it.

@@ -141,7 +141,7 @@ class GripperTask:
 
     async def open_by_operator(self) -> None:
         """Open wide, also after a fault, once the operator says that a tool may drop; raises as `release` does."""
-        await self.unlock(confirmed=True)
+        await self._end_fault(confirmed=True)
         await self.release()
 
     async def halt(self) -> None:
@@ -150,14 +150,20 @@ class GripperTask:
             await _tried(self.gripper.halt)
 
     async def unlock(self, *, confirmed: bool = False) -> None:
-        """Activate again after a fault, which opens the fingers; raises DriverError.
+        """Activate again after a fault, which opens the fingers; raises DriverError and ActionError.
 
         Where they hold something, or may, it has to be `confirmed` by the operator, else this raises NotBegunError.
         """
+        if await self._end_fault(confirmed=confirmed):
+            # An activation leaves the fingers open. Only a motion shows the gripper whether they hold something.
+            await self.release()
+
+    async def _end_fault(self, *, confirmed: bool) -> bool:
+        """Activate the gripper if it has a fault that needs it; return whether it had one. Raises as `unlock` does."""
         # Read now: the latest state may be older than the fault.
         state = await self.gripper.read()
         if not state.fault.needs_activation:
-            return
+            return False
         status = self.status_of(state)
         self.control_loop.on_gripper(status)
         if not confirmed and status.may_hold:
@@ -165,8 +171,7 @@ class GripperTask:
             raise NotBegunError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
             await self.gripper.activate(operator_confirmed=True)
-        # An activation leaves the fingers open. Only a motion shows the gripper whether they hold something.
-        await self.grip(OPENING)
+        return True
 
     @property
     def is_holding(self) -> bool | None:

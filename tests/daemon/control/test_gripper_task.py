@@ -20,7 +20,14 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.messages import ActivationStatus, GripperFault, GripperState, ObjectStatus
+from shearloop.drivers.robotiq.messages import (
+    ActivationStatus,
+    GripperCommand,
+    GripperFault,
+    GripperMove,
+    GripperState,
+    ObjectStatus,
+)
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers, GripperRegisters
@@ -371,6 +378,26 @@ async def test_unlock_handles_a_fault_newer_than_the_state(way, tmp_path):
         rig.model.fail(12)
         await task_of(rig).unlock(confirmed=True)
         assert not (await rig.driver.read()).fault.needs_activation
+
+
+@WAYS
+@pytest.mark.parametrize("command", ["unlock", "release"])
+async def test_fingers_open_after_a_fault_although_a_request_fails_once(way, tmp_path, command, monkeypatch):
+    """The way out does not end at the first request that the gripper does not answer."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, _ = await holding(rig)
+        rig.model.fail(12)
+        move, losses = rig.driver.move, [DriverError("the gripper did not answer")]
+
+        async def fail_once(request: GripperCommand) -> GripperMove:
+            if losses:
+                raise losses.pop()
+            return await move(request)
+
+        monkeypatch.setattr(rig.driver, "move", fail_once)
+        await (task.unlock(confirmed=True) if command == "unlock" else task.open_by_operator())
+        assert losses == []
+        assert not task.status_of(await rig.driver.read()).may_hold
 
 
 @WAYS

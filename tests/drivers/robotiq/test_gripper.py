@@ -203,40 +203,32 @@ async def test_halt_after_a_failed_activation_keeps_the_fault(way, tmp_path):
             await rig.driver.activate()
 
 
+NEEDS_ACTIVATION = {
+    "too hot": (lambda model: model.fail(8), messages.GripperTooHotError, "too hot"),
+    "inactive": (lambda model: model.write(GripperRegisters()), messages.GripperInactiveError, "has to be activated"),
+}
+
+
 @WAYS
-async def test_a_gripper_that_is_too_hot_is_not_activated_and_drops_nothing(way, tmp_path):
+@pytest.mark.parametrize("state", NEEDS_ACTIVATION)
+async def test_a_gripper_that_may_hold_an_object_is_activated_only_where_it_may_drop(way, state, tmp_path):
+    """Its activation opens the fingers, and an inactive gripper cannot say whether it holds something."""
+    bring_about, refusal, why = NEEDS_ACTIVATION[state]
     async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.object_mm = 40.0
+        model = rig.model
+        model.object_mm = 40.0
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(5.0)))
-        held_mm = rig.model.width_mm
-        rig.model.fail(8)
+        bring_about(model)
+        model.step(STEP_S)
         await rig.driver.read()
-        with pytest.raises(messages.GripperTooHotError, match="too hot"):
+        before = model.width_mm, model.sta, model.taken.act
+        with pytest.raises(refusal, match=why):
             await rig.driver.activate()
         await rig.driver.read()
-        assert rig.model.width_mm == held_mm
-        assert rig.model.taken.act, "it was not reset"
-        # Where the tool is to drop anyway, nothing keeps it.
+        assert (model.width_mm, model.sta, model.taken.act) == before
         await rig.driver.activate(may_drop=True)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(140.0)))
-        assert rig.model.width_mm > 100
-
-
-@WAYS
-async def test_an_inactive_gripper_is_activated_only_where_an_object_may_drop(way, tmp_path):
-    """It cannot say whether it holds one."""
-    async with a_rig(way, tmp_path, active=True) as rig:
-        rig.model.object_mm = 40.0
-        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(5.0)))
-        held_mm = rig.model.width_mm
-        rig.model.write(GripperRegisters())
-        rig.model.step(STEP_S)
-        await rig.driver.read()
-        with pytest.raises(messages.GripperInactiveError, match="has to be activated"):
-            await rig.driver.activate()
-        assert (rig.model.width_mm, rig.model.sta) == (held_mm, 0)
-        await rig.driver.activate(may_drop=True)
-        assert rig.model.width_mm > 100
+        assert model.width_mm > 100
 
 
 @WAYS

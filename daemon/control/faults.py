@@ -80,9 +80,9 @@ class FaultCode(Enum):
     ZERO_LOST = Rule(
         _KEEP,
         "the torque that drives the wrist counts from no known zero: {detail}.",
-        "Take the tool out with `shearloop command release --yes`, or turn a clamped one back with a step `turn_to`. "
-        "Send `shearloop command unlock`, and take the zero with nothing gripped: `shearloop command tare`, or a step "
-        "`tare`.",
+        "Take a gripped tool out with `shearloop command release --yes`, then send `shearloop command unlock`. Turn a "
+        "clamped tool back with a step `turn_to`. Then take the zero with nothing loaded: `shearloop command tare`, or "
+        "a step `tare`.",
     )
     ESTIMATE_INVALID = Rule(
         _HOLD,

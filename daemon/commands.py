@@ -143,7 +143,7 @@ class Commands:
     async def _experiments(self, _request: Request) -> Reply:
         """Return the experiments that `start` may name, and the configured one, which it runs without a name.
 
-        While something moves and none were read before, there are none, and `unread` says why.
+        Where none were read before, and none can be read now, there are none, and `unread` says why.
         """
         rig = required_rig(self.rig)
         try:
@@ -173,10 +173,12 @@ class Commands:
         rig = required_rig(self.rig)
         try:
             if request.get("ask"):
-                from shearloop.daemon.operator_questions import startable
-
                 _refuse_if(rig.start_refusal())
-                experiment = await startable(Path(path), rig.experiments, rig.control_loop.operator)
+                experiment = await rig.experiments.read(Path(path))
+                # The files above were found unchanged, so that this module is of the daemon's version.
+                from shearloop.daemon.operator_questions import file_refusal
+
+                _refuse_if(file_refusal(rig.control_loop.operator, experiment.file))
                 return dict(rig.question_of(experiment).facts)
             digest, confirmed = request.get("digest"), bool(request.get("confirmed"))
             _refuse_if(await rig.start(Path(path), digest, self._deadline(request), confirmed=confirmed))

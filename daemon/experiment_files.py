@@ -126,7 +126,8 @@ class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
     Each can run on the rig of `config`, with its torque `sources`, but the robot's, and its `robot`, if that is known.
-    None begins where a file of `loaded` has changed: its check may be loaded with the first experiment.
+    None begins, and none is listed anew, where a file of `loaded` has changed: the check of experiments is loaded with
+    the first one.
     """
 
     folders: tuple[Path, ...]
@@ -163,6 +164,9 @@ class ExperimentFiles:
         """Read the files that have changed and renew the list; return None, or why no file is read now."""
         if (reason := reading_refusal()) is not None:
             return reason
+        # The list loads the check too.
+        if outdated := await self._in_thread(self.loaded.why_outdated):
+            return outdated
         stamps = await self._in_thread(self._stamps)
         # Of files that are gone, nothing is kept.
         self._listed = {path: one for path, one in self._listed.items() if path in stamps}

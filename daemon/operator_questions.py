@@ -4,7 +4,6 @@ Nothing moves while the question is open, so its modules are loaded then.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
@@ -15,15 +14,6 @@ from shearloop.daemon.control.sensor_reach import tool_note
 from shearloop.daemon.control.step_motions import first_grip, first_gripper_step, first_motion_before_grip
 from shearloop.daemon.experiment_files import ExperimentFiles, ReadExperiment
 from shearloop.daemon.questions import Question, digest_of
-from shearloop.errors import UserError
-
-
-async def startable(path: Path, files: ExperimentFiles, operator: OperatorView) -> ReadExperiment:
-    """Return the experiment of a file; raises UserError if it is not valid, or cannot begin with the present tool."""
-    experiment = await files.read(path)
-    if (reason := file_refusal(operator, experiment.file)) is not None:
-        raise UserError(reason)
-    return experiment
 
 
 def question_of(experiment: ReadExperiment, files: ExperimentFiles, loop: ControlLoop, *occasion: str) -> Question:

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -312,6 +313,18 @@ class Noted(NoMemory):
 
     async def begins(self, experiment: str) -> None:
         self.noted.append(experiment)
+
+
+async def test_a_question_loads_no_module_after_an_upgrade_in_place(folder, monkeypatch):
+    one = rig(folder, Runner())
+    changed = folder / "module.py"
+    changed.write_text("VERSION = 1\n")
+    one.experiments.loaded = LoadedFiles([changed])
+    changed.write_text("VERSION = 2\n")
+    # An import of it fails.
+    monkeypatch.setitem(sys.modules, "shearloop.daemon.operator_questions", None)
+    with pytest.raises(CommandRefusedError, match=r"module\.py has changed since the daemon began"):
+        await answers_of(one)["start"]({"experiment": str(write(folder / "one.yaml", VALID)), "ask": True})
 
 
 async def test_an_experiment_that_is_refused_is_not_kept_as_the_one_that_runs(folder):

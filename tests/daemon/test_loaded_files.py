@@ -72,6 +72,9 @@ async def test_no_experiment_begins_after_an_upgrade_in_place(rig, upgraded):
     (rig.parent / "one.yaml").write_text("name: one\n")
     with pytest.raises(UserError, match=f"^{package / upgraded} {OUTDATED}"):
         await files.read(rig.parent / "one.yaml")
+    listed = await files.list()
+    assert listed.names == {}
+    assert listed.unread.startswith(f"{package / upgraded} {OUTDATED}")
 
 
 def test_the_code_has_every_module_that_a_daemon_has_loaded():

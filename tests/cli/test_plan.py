@@ -11,7 +11,7 @@ from shearloop.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.plan import plan_of
+from shearloop.daemon.control.plan import Plan, StepPlan, plan_of
 from shearloop.daemon.experiment_files import ExperimentFiles, InvalidExperimentError
 from shearloop.daemon.loaded_files import LoadedFiles
 from shearloop.daemon.motion_cap import Commissioning
@@ -80,10 +80,46 @@ def test_the_plan_of_every_delivered_experiment_is_in_words_and_in_numbers(path,
     assert planned["torque_nm"] == (asked or (None if any(by_angle) else 0))
     assert planned["torque_is_known"] is not any(by_angle)
     assert [step["torque_nm"] is None for step in planned["steps"]] == by_angle
-    assert planned["duration_s"] == pytest.approx(sum(step["duration_s"] for step in planned["steps"]))
+    for time in ("duration_s", "longest_s"):
+        assert planned[time] == pytest.approx(sum(step[time] for step in planned["steps"]))
     assert not any(step["refused"] for step in planned["steps"])
     notes = {step["number"]: step["notes"] for step in planned["steps"] if step["notes"]}
     assert notes == NOTES.get(path.stem, {})
+
+
+def test_each_value_of_a_plan_is_in_its_json_under_its_name():
+    values = {
+        "number": 1,
+        "do": "tighten",
+        "text": "turns",
+        "duration_s": 2.0,
+        "longest_s": 3.0,
+        "direction": "clockwise",
+        "torque_nm": 0.04,
+        "angle_rad": 0.05,
+        "force_n": 6.0,
+        "timeout_s": 7.0,
+        "reverses": True,
+        "may_reverse": False,
+        "turns_back": True,
+        "way_unknown": False,
+        "moves": True,
+        "notes": ("note",),
+        "refused": ("reason",),
+    }
+    later = {"number": 2, "duration_s": 20.0, "longest_s": 30.0, "torque_nm": 0.4, "angle_rad": 0.5, "force_n": 60.0}
+    own = {"name": "one", "torque_source": "skin", "limit_nm": 0.8, "limit_rad": 0.9, "unknown": "u", "assumed": "a"}
+    plan = Plan(steps=(StepPlan(**values), StepPlan(**{**values, **later})), **own)
+    assert plan.as_json() == {
+        **own,
+        "steps": (values, {**values, **later}),
+        "duration_s": 22.0,
+        "longest_s": 33.0,
+        "torque_nm": 0.4,
+        "torque_is_known": True,
+        "angle_rad": 0.5,
+        "force_n": 60.0,
+    }
 
 
 def test_a_reversal_is_pointed_out_at_its_step(tmp_path, result_of, ran):

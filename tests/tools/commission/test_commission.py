@@ -21,6 +21,7 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.refusals import Refusals
 from shearloop.daemon.messaging.stop_socket import StopSocket
 from shearloop.daemon.robot_files import RobotFiles, lock_robot
+from shearloop.daemon.supplied_values import Supplied
 from shearloop.drivers.ur.control_box import ControllerInfo
 from shearloop.drivers.ur.limits import tool_difference
 from shearloop.drivers.ur.messages import RtdeOutputs
@@ -195,6 +196,61 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
     assert "emulated" not in text.lower()
     renamed = good.model_copy(update={"stage": "0 robot"})
     assert with_stage(found, renamed).stages == (renamed,), "the figure names the stage"
+
+
+class Cells(HTMLParser):
+    """The rows of a page's tables."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: list[list[str]] = []
+        self.is_cell = False
+
+    def handle_starttag(self, tag: str, _attributes: object) -> None:
+        if tag == "tr":
+            self.rows.append([])
+        if tag in ("td", "th"):
+            self.rows[-1].append("")
+        self.is_cell = tag in ("td", "th")
+
+    def handle_endtag(self, _tag: str) -> None:
+        self.is_cell = False
+
+    def handle_data(self, data: str) -> None:
+        if self.is_cell:
+            self.rows[-1][-1] += data
+
+
+def test_file_and_page_have_each_value_of_a_stage_under_its_name(tmp_path):
+    line = {"what": "w", "value": "v < 1", "limit": "l", "count": 7, "promise": "p", "verdict": "passed"}
+    supplies = {
+        "wrist_speed_rad_per_s": 0.45,
+        "torque_nm": 0.35,
+        "torque_sources": {"right": "a" * 64, "wrench": ""},
+        "rest_rad_per_s": 0.006,
+        "actuation_s": 0.03,
+        "reaction_s": 0.04,
+        "stop_rad": 0.15,
+        "widths": [[70.0, 100.0], [198.0, 20.0]],
+    }
+    content = {
+        "stage": "7 tool and spring",
+        "operator": "Ada",
+        "date": "2026-01-02T03:04:00Z",
+        "lines": [line],
+        "supplies": supplies,
+        "judged_sha256s": {"load_cell": "b"},
+    }
+    result = StageResult.model_validate(content)
+    report = with_stage(Report(rig=RIG), result)
+    path = tmp_path / "report.yaml"
+    page = Cells()
+    page.feed(save_report(path, report).read_text())
+    assert yaml.safe_load(path.read_text()) == {"version": 3, "rig": RIG.model_dump(), "stages": [content]}
+    assert earlier_report(path) == report
+    headings, values = page.rows
+    assert dict(zip(headings, values, strict=True)) == {name: str(value) for name, value in line.items()}
+    assert supplies.keys() == Supplied.model_fields.keys()
 
 
 def stage(verdict: str) -> StageResult:

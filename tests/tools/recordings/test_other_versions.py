@@ -29,6 +29,7 @@ from tests.tools.recordings.every_message import Recorded, made
 from tests.tools.recordings.test_every_way_out import check_lerobot, check_rerun, check_tables
 from tests.tools.recordings.test_matlab_slices import Sweep
 from tests.tools.recordings.test_replay import replayed
+from tests.tools.recordings.test_units import check_table_units, declared
 
 pytestmark = pytest.mark.usefixtures("rerun_runtime")
 FURTHER = "grip_force"
@@ -187,6 +188,43 @@ def test_a_replay_names_the_keys_that_only_one_of_both_versions_has(source, conf
     assert said.count(f"Other code (shearloop 0.1.0) made the recording with {FURTHER} of loop.state") == 1
 
 
+def test_a_replay_prints_each_count_and_each_difference_under_its_name(source, config, tmp_path, ran):
+    one = other(source, tmp_path / "keys.mcap", {"health": "instance"}, ["loop.state"])
+    path = with_definition(one.path, tmp_path / "unit.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
+    path = rewritten(path, tmp_path / "x.mcap", lambda _, own: own, renamed={"gripper.state": "hand.posture"})
+    arguments = ["--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max", "--json"]
+    printed = json.loads(ran("recording", "replay", path, *arguments).out)
+    _, comparison = asyncio.run(replayed(path, math.inf, load_daemon_config(config())))
+    counted = ("compared", "different", "without_state", "unrecorded", "examples", "dropped_at_opening")
+    assert printed == {
+        **{name: json.loads(json.dumps(getattr(comparison, name))) for name in counted},
+        "before_state": {".".join(stream): count for stream, count in comparison.before_state.items()},
+        "same_code": False,
+        "not_recorded": {"health": ["instance"]},
+        "left_out": {"loop.state": [FURTHER]},
+        "differing": {"load.torque": {"torque_nm": "in mN·m, not in N·m"}},
+        "left_out_topics": ["hand.posture"],
+    }
+
+
+def test_the_summary_prints_each_value_of_a_topic_under_its_name(source, tmp_path, result_of):
+    one = other(source, tmp_path / "keys.mcap", {"load.torque": "raw"}, ["load.torque"])
+    path = with_definition(one.path, tmp_path / "unit.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
+    path = rewritten(path, tmp_path / "x.mcap", lambda _, own: own, renamed={"gripper.state": "hand.posture"})
+    topics = result_of("recording", "info", path)["topics"]
+    assert topics["load.torque"] == {
+        "messages": 7,
+        "rate_hz": None,
+        "known": True,
+        "not_recorded": ["raw"],
+        "unknown": [FURTHER],
+        "differing": {"torque_nm": "in mN·m, not in N·m"},
+        "problem": "",
+    }
+    known = {topic: summary["known"] for topic, summary in topics.items()}
+    assert known == {topic: topic != "hand.posture" for topic in topics}
+
+
 @pytest.mark.parametrize(
     ("topic", "key"),
     [*((topic, key) for topic, keys in REPLAY_NEEDS.items() for key in keys), *(("health", key) for key in ENVELOPE)],
@@ -289,6 +327,33 @@ def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(
     assert {content["torque_nm"] for topic, content in sent if topic == "load.torque"} == {None}
     said = ran("recording", "replay", path, "--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max")
     assert f"with {recorded_so}, of load.torque: no value is sent there" in said.err
+
+
+def test_each_table_has_the_recorded_unit_of_keys_and_topics_of_other_versions(source, tmp_path, ran):
+    one = other(source, tmp_path / "keys.mcap", {}, ["loop.state"])
+    path = with_definition(one.path, tmp_path / "unit.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
+    path = rewritten(path, tmp_path / "x.mcap", lambda _, own: own, renamed={"gripper.state": "hand.posture"})
+    expected = declared(Recorded(source, []).columns())
+    expected["loop.state"][FURTHER] = "N"
+    expected["load.torque"]["torque_nm"] = "mN·m"
+    expected["hand.posture"] = expected.pop("gripper.state")
+    check_table_units(path, tmp_path, expected, ran)
+
+
+def test_no_chart_of_rerun_draws_a_torque_in_another_unit(source, tmp_path, monkeypatch, ran):
+    blueprint = pytest.importorskip("rerun.blueprint", reason="needs the extra `rerun`")
+    charts: dict[str, list[str]] = {}
+    view = blueprint.TimeSeriesView
+
+    def drawn(*, name: str, contents: list[str]) -> Any:
+        charts[name] = contents
+        return view(name=name, contents=contents)
+
+    monkeypatch.setattr(blueprint, "TimeSeriesView", drawn)
+    path = with_definition(source, tmp_path / "x.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
+    ran("recording", "export", path, "--format", "rrd", "--out", tmp_path / "a.rrd")
+    assert "robot/state/wrist_torque_nm" in charts["torque (N·m)"]
+    assert not any("load/torque/torque_nm" in chart for chart in charts.values())
 
 
 def test_another_unit_of_a_needed_key_refuses_slices_and_replay(source, tmp_path, mistake):

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -38,24 +39,30 @@ def csv_units(path: Path) -> Units:
     return found
 
 
-def test_each_way_out_has_the_messages_units(tmp_path, ran):
+def check_table_units(path: Path, out: Path, expected: Units, ran: Callable[..., object]) -> None:
+    """Export a recording as tables, and compare the unit of each column with the expected one."""
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
-    one = made(tmp_path)
-    expected = declared(one.columns())
-    assert expected["eit.frame.right"]["channels"] == "V"
-    assert expected["robot.state"]["wrench"] == "N, N·m"
-    for form in ("csv", "parquet", "mat", "lerobot"):
-        ran("recording", "export", one.path, "--format", form, "--out", tmp_path / form)
-    assert csv_units(tmp_path / "csv" / "units.csv") == expected
-    read = shearloop.read(one.path)
-    (structs,) = loadmat(tmp_path / "mat.mat", squeeze_me=True)["units"].reshape(1)
+    for form in ("csv", "parquet", "mat"):
+        ran("recording", "export", path, "--format", form, "--out", out / form)
+    assert csv_units(out / "csv" / "units.csv") == expected
+    read = shearloop.read(path)
+    (structs,) = loadmat(out / "mat.mat", squeeze_me=True)["units"].reshape(1)
     assert len(structs.dtype.names) == len(expected)
     for topic, units in expected.items():
-        fields = parquet.read_schema(tmp_path / "parquet" / f"{topic}.parquet")
+        fields = parquet.read_schema(out / "parquet" / f"{topic}.parquet")
         assert {field.name: field.metadata[b"unit"].decode() for field in fields if field.metadata} == units
         struct = structs[topic.replace(".", "_").replace("-", "_")]
         assert {key: str(struct[key]) for key in struct.dtype.names} == units
         assert read.units(topic) == units
+
+
+def test_each_way_out_has_the_messages_units(tmp_path, ran):
+    one = made(tmp_path)
+    expected = declared(one.columns())
+    assert expected["eit.frame.right"]["channels"] == "V"
+    assert expected["robot.state"]["wrench"] == "N, N·m"
+    check_table_units(one.path, tmp_path, expected, ran)
+    ran("recording", "export", one.path, "--format", "lerobot", "--out", tmp_path / "lerobot")
     features = json.loads((tmp_path / "lerobot/meta/shearloop.json").read_text())["units"]
     assert features["observation.channels.right"] == {"channels": "V"}
     assert features["observation.load"] == {"torque_nm": "N·m"}

@@ -200,16 +200,17 @@ def check_place(outputs: RtdeOutputs, limits: UrLimits) -> Finding:
 
 
 def check_payload(arm: Arm, *payloads_kg: float | None) -> Finding | None:
-    """Return the finding on a payload that the arm is not rated for, or may not be, or None."""
-    for payload_kg in (kg for kg in payloads_kg if kg is not None):
-        if arm.is_beyond(payload_kg):
-            found = f"{payload_kg:g} kg is above the rated payload of this {arm.model}, {arm.rated}"
-            cure = "mount less, and correct `tool.payload_kg` and the pendant"
-            return trouble("payload", found, "the arm cannot hold it safely", cure)
-        if arm.may_be_beyond(payload_kg):
-            found = f"{payload_kg:g} kg is mounted, and a {arm.model} is rated for {arm.rated}"
-            cure = "read the arm's type plate, and mount less if it says less"
-            return note("payload", found, "an arm of an earlier year cannot hold it safely", cure)
+    """Return the finding on a payload that no arm of this model is rated for, or else only some are; None without."""
+    beyond_kg = next(filter(arm.is_beyond, payloads_kg), None)
+    if beyond_kg is not None:
+        found = f"{beyond_kg:g} kg is above the rated payload of this {arm.model}, {arm.rated}"
+        cure = "mount less, and correct `tool.payload_kg` and the pendant"
+        return trouble("payload", found, "the arm cannot hold it safely", cure)
+    unsure_kg = next(filter(arm.may_be_beyond, payloads_kg), None)
+    if unsure_kg is not None:
+        found = f"{unsure_kg:g} kg is mounted, and a {arm.model} is rated for {arm.rated}"
+        cure = "read the arm's type plate, and mount less if it says less"
+        return note("payload", found, "an arm of an earlier year cannot hold it safely", cure)
     return None
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -105,7 +106,14 @@ async def test_a_model_that_no_measured_width_confirms_is_named(rig_config, cali
 
 
 @pytest.mark.parametrize(
-    ("payloads_kg", "state"), [((9.0, 9.0), None), ((11.0, 11.0), "note"), ((13.0, 13.0), "trouble")]
+    ("payloads_kg", "state"),
+    [
+        ((9.0, 9.0), None),
+        ((math.nan, None), None),
+        ((11.0, 11.0), "note"),
+        ((13.0, 13.0), "trouble"),
+        ((11.0, 13.0), "trouble"),
+    ],
 )
 def test_a_payload_is_judged_by_the_arms_that_a_model_may_be(payloads_kg, state):
     found = devices.check_payload(Arm("UR10", (10.0, 12.5)), *payloads_kg)

@@ -150,8 +150,8 @@ def _run(argv: Sequence[str] | None) -> int:
         if not interrupt_is_end:
             # A closed terminal accepts no output.
             with contextlib.suppress(OSError):
-                kept = "".join(f". {note}" for note in getattr(interrupt, "__notes__", ()))
-                print(f"{program}: interrupted before it was done{kept}", file=sys.stderr)
+                notes = "".join(f". {note}" for note in getattr(interrupt, "__notes__", ()))
+                print(f"{program}: interrupted before it was done{notes}", file=sys.stderr)
         return interrupt_status(interrupt)
 
 

@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _note_reach(config: "DaemonConfig", parts: "Parts") -> None:
-    """Say that a rehearsal is refused whose emulated arm does not reach the workspace; the real arm may be larger."""
+    """Add why a rehearsal is refused, if its emulated arm does not reach the workspace. The real arm may be larger."""
     from shearloop.cli.rehearsal import refuse_workspace_out_of_reach
 
     try:

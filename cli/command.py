@@ -146,7 +146,8 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
     # It imports too much for a `stop` on a busy computer.
     from shearloop.daemon.messaging.client import send_command
 
-    timeout_s, causes = args.timeout, ""
+    timeout_s = args.timeout
+    acknowledged = ""
     if timeout_s is None:
         timeout_s = addresses.UNLOCK_TIMEOUT_S if args.name in addresses.SLOW else addresses.COMMAND_TIMEOUT_S
     if args.name not in _ACTS_ON_NOTHING_SHOWN:
@@ -158,11 +159,12 @@ def _sent(args: argparse.Namespace, request: dict[str, Any], keys: "ClientKeys |
         request |= meant_for(status, 0.0 if args.name in NEVER_LATE else _age_s(args), TYPED_WITHIN_S)
         if args.name == "unlock":
             loop = status.get("loop", {})
-            causes = loop.get("stop_causes", "")
-            request |= {"stop": loop["stop"]} if "stop" in loop else {}
+            acknowledged = loop.get("stop_causes", "")
+            if "stop" in loop:
+                request["stop"] = loop["stop"]
     reply = send_command(args.connect, request, timeout_s, keys)
-    if causes and reply.get("ok"):
-        print(f"unlock acknowledged the stop: {causes}.", file=sys.stderr)
+    if acknowledged and reply.get("ok"):
+        print(f"unlock acknowledged the stop: {acknowledged}.", file=sys.stderr)
     return reply
 
 

@@ -66,8 +66,7 @@ def run(args: argparse.Namespace) -> int:
     label = f"{EMULATED}: " if args.emulate or config.emulated else ""
     terminal = Terminal(sys.stderr if args.json else sys.stdout, label)
     with ExitStack() as emulating:
-        # The lines say what matters here. A warning is of a client of the held address alone, and would stand between
-        # questions.
+        # Errors only: a warning reports a client of the held address, and would appear between the questions.
         emulating.enter_context(logging_to_stderr(level=logging.ERROR))
         order = None
         if args.emulate:
@@ -89,15 +88,17 @@ def run(args: argparse.Namespace) -> int:
         if settings is not None:
             named = config.model_copy(update={"commissioned": args.out})
             if allowed := commissioning_of(named, settings).sentence:
-                sentences.append(f"{label}With {naming(args.out, args.config, rehearsed=args.emulate)}, {allowed}.")
+                sentences.append(
+                    f"{label}With {how_to_configure(args.out, args.config, rehearsed=args.emulate)}, {allowed}."
+                )
     print_result(report.model_dump(mode="json", exclude_none=True), sentences, as_json=args.json)
     return 0 if report.passed else 1
 
 
-def naming(report: Path, config: Path, *, rehearsed: bool) -> str:
-    """Return what gives a report to the daemon; its path counts from the configuration's folder.
+def how_to_configure(report: Path, config: Path, *, rehearsed: bool) -> str:
+    """Return the option or the line of the configuration that names a report, from the configuration's folder.
 
-    A real rig's configuration would refuse a report of emulated devices.
+    A real rig's configuration would refuse a report of emulated devices, so a `rehearsed` one is named by an option.
     """
     import yaml
 

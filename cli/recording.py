@@ -186,7 +186,7 @@ def _other_keys(found: "RecordingSummary") -> list[str]:
             lines.append(f"  {name} was recorded without {', '.join(topic.not_recorded)}: exports have no value there.")
         if topic.differing:
             recorded = ", ".join(f"{key} {how}" for key, how in topic.differing.items())
-            lines.append(f"  {name} was recorded with {recorded}: tables have it so, and nothing computes with it.")
+            lines.append(f"  {name} was recorded with {recorded}: tables have this, and no command computes with it.")
         if not topic.known:
             lines.append(f"  {name} is a topic that this version does not have: csv, parquet, mat and rrd have it.")
         if topic.unknown:
@@ -208,7 +208,7 @@ def _repair(args: argparse.Namespace) -> int:
     saved = counted(result.messages, "message is", "messages are")
     sentences = [f"{result.path}: {saved} saved; left out: {' and '.join(lost) or 'nothing'}."]
     if not result.was_damaged and not result.being_written:
-        sentences.append(f"{path} was intact: it needs no repair, and the copy holds the same.")
+        sentences.append(f"{path} was intact: it needs no repair, and the copy has the same content.")
     sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
     if result.being_written:
         sentences.append(f"{path} is being written: the copy ends with the present content.")

@@ -52,7 +52,7 @@ def refuse_workspace_out_of_reach(config: "DaemonConfig") -> None:
 
     if config.robot is None or config.emulated:
         return
-    # The mistakes in the settings are told elsewhere.
+    # The check of the robot's settings reports their mistakes.
     with contextlib.suppress(DriverError):
         _robot_arguments(read_settings(config.robot))
 

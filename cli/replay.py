@@ -129,9 +129,9 @@ def _other_keys_text(run: "RecordedRun", made_by: str) -> list[str]:
 
     other = f"Other code (shearloop {made_by}) made the recording"
     lines = [f"{other} without {named(run.not_recorded)}: no value is sent there."] if run.not_recorded else []
-    for topic, keys in run.differing.items():
-        recorded = ", ".join(f"{key} {how}" for key, how in keys.items())
-        lines.append(f"{other} with {recorded}, of {topic}: no value is sent there.")
+    recorded = [f"{key} of {topic} {how}" for topic, keys in run.differing.items() for key, how in keys.items()]
+    if recorded:
+        lines.append(f"{other} with {'; '.join(recorded)}: no value is sent there.")
     if run.left_out:
         lines.append(f"{other} with {named(run.left_out)}: this version does not have that, and leaves it out.")
     if run.unknown_topics:

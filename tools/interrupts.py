@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back meanwhile, and from processes that are started meanwhile until they let it through.
+    """Block Ctrl-C in this thread, and in the processes that it starts, until they let it through.
 
-    A process that loads its modules prints a traceback where Ctrl-C reaches it.
+    A process that is interrupted while it loads its modules prints a traceback.
     """
     with _masked(signal.SIG_BLOCK):
         yield
@@ -17,7 +17,7 @@ def interrupts_held() -> Iterator[None]:
 
 @contextmanager
 def interrupts_let_through() -> Iterator[None]:
-    """Let Ctrl-C through meanwhile, also where the process was started without it."""
+    """Let Ctrl-C through, also in a process that was started with Ctrl-C blocked."""
     with _masked(signal.SIG_UNBLOCK):
         yield
 

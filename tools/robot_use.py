@@ -1,4 +1,4 @@
-"""Which other programs use a robot, as its controller reports: also those of other users and other computers."""
+"""The other programs that use a robot, as its controller reports; also programs of other users and computers."""
 
 from contextlib import closing, suppress
 from dataclasses import dataclass

@@ -104,8 +104,8 @@ class Context:
     def expect_no_other_program(self) -> None:
         """Return once nothing else commands the robot, or the operator accepts what does; raises DeclinedError.
 
-        Raises UserError where others write all registers, or a program may be another daemon's. Any other program is
-        asked about each time; it would be replaced.
+        Raises UserError if others write all registers, or if a program may belong to another daemon. The operator is
+        asked about any other program each time, because the commissioning replaces it.
         """
         if self._mover is not None:
             # The observer reads the robot's state all the time. Only our program changes this clock.
@@ -135,7 +135,7 @@ class Context:
                     self._accepted.add(sign)
 
     def _another_plays(self) -> bool:
-        """Return whether a program plays whose clock, in the registers that we write, stands still."""
+        """Return whether a program plays that is not ours: the clock in our registers stands still."""
         self.observer.forget()
         latest = [seen for seen in self.observer.listen(_CLOCK_S) if seen.plays][-_CLOCK_SAMPLES:]
         return len(latest) == _CLOCK_SAMPLES and len({seen.outputs.script_ticks for seen in latest}) == 1

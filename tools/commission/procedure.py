@@ -128,7 +128,10 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
     for stage, measure in STAGES.items():
         number = stage_number(stage)
         done = context.report.stage(number)
-        is_due = number in only if only else done is None or not done.passed
+        if only:
+            is_due = number in only
+        else:
+            is_due = done is None or not done.passed
         if not is_due:
             continue
         if failed := [one for one in context.report.stages if not one.passed and one.number < number]:

@@ -41,9 +41,10 @@ REPEATS_MM: Final = 1.0
 SCALE_TOLERANCE: Final = 0.2
 # A lever presses one way only if the other torques are below this fraction.
 _ONE_WAY: Final = 0.3
-# A turn shows on a device as more than this fraction of the spring's torque, and of the angle, and beyond the noise.
+# A change has a sign if it is larger than these fractions of the spring's torque and of the wrist's turn,
 _SHOWN_TORQUE: Final = 0.05
 _SHOWN_ANGLE: Final = 0.5
+# and than this number of standard errors.
 _NOISE_ERRORS: Final = 4.0
 # The twists at which the fingertips are read too.
 _FELT: Final = 2
@@ -116,7 +117,7 @@ def measure(context: Context) -> Measured:
 
 
 def covered_nm(held: Sequence[Held], way: int = 0) -> float:
-    """Return the largest torque that the twists reached; of both directions if `way`, the only one, is 0."""
+    """Return the largest torque that the twists reached in the direction `way`, or in both directions if it is 0."""
     first, *twisted = held[:-1]
     ways = (1, -1) if way == 0 else (way,)
     return min(_largest_nm(first, twisted, one) or 0.0 for one in ways)
@@ -128,15 +129,17 @@ def _largest_nm(first: Held, twisted: Sequence[Held], way: int) -> float | None:
 
 
 def raised_line(largest_nm: float, right: Sequence[str], direction: Direction | None = None) -> Line:
-    """Return the line on the torque that the report allows, of which sources, and in which only `direction`."""
-    sources, way = " and ".join([LOAD_CELL, *right]), f", {direction} alone" if direction is not None else ""
-    other = "any other source" if direction is None else "else"
-    value = f"up to {largest_nm:.3f} N·m of {sources}{way}; {other} {CAPPED_NM:g} N·m"
+    """Return the line on the torque that the report allows: for its sources, in both directions or in `direction`."""
+    sources = " and ".join([LOAD_CELL, *right])
     if largest_nm <= CAPPED_NM:
         value = (
             f"not raised: the twists reached {largest_nm:.3f} N·m, and {CAPPED_NM:g} N·m need no report; "
             f"a spring that is stiffer together with the pads reaches more within {TURN_RAD:g} rad"
         )
+    elif direction is None:
+        value = f"up to {largest_nm:.3f} N·m of {sources}; any other source {CAPPED_NM:g} N·m"
+    else:
+        value = f"up to {largest_nm:.3f} N·m of {sources}, {direction} alone; else {CAPPED_NM:g} N·m"
     return Line(what="allowed torque", value=value)
 
 
@@ -148,11 +151,13 @@ def _tactile(context: Context, opened: ExitStack) -> list[TactileSensor]:
         name: opened.enter_context(context.rig.fingertip(name))
         for name in dict.fromkeys(side for _, sides in sessions.values() for side in sides)
     }
-    gels, found = gels_of(config), []
+    gels = gels_of(config)
+    sensors = []
     for name, (session, sides) in sessions.items():
-        own, period_s = {side: boards[side] for side in sides}, config.fingertips[sides[0]].frame_period_s
-        found.append(TactileSensor(name, session, own, period_s, gels.get(name)))
-    return found
+        own_boards = {side: boards[side] for side in sides}
+        period_s = config.fingertips[sides[0]].frame_period_s
+        sensors.append(TactileSensor(name, session, own_boards, period_s, gels.get(name)))
+    return sensors
 
 
 def repeated_grips(context: Context, tactile: Sequence[TactileSensor]) -> list[Line]:
@@ -202,12 +207,18 @@ def _hold(context: Context, sensors: Sensors) -> Held:
 
 
 def _hold_and_feel(context: Context, sensors: Sensors) -> Held:
-    """Return the measurements while the wrist stands."""
+    """Return the measurements while the wrist stands, with those of the fingertips."""
     held = _hold(context, sensors)
-    felt = {sensor.name: sensor.torques_nm() for sensor in sensors.tactile}
-    means_nm = {name: statistics.fmean(torques_nm) if torques_nm else None for name, torques_nm in felt.items()}
-    errors_nm = {name: standard_error(torques_nm) for name, torques_nm in felt.items() if torques_nm}
-    return replace(held, tactile_nm=means_nm, errors_nm={**held.errors_nm, **errors_nm})
+    means_nm: dict[str, float | None] = {}
+    errors_nm = dict(held.errors_nm)
+    for sensor in sensors.tactile:
+        torques_nm = sensor.torques_nm()
+        if torques_nm:
+            means_nm[sensor.name] = statistics.fmean(torques_nm)
+            errors_nm[sensor.name] = standard_error(torques_nm)
+        else:
+            means_nm[sensor.name] = None
+    return replace(held, tactile_nm=means_nm, errors_nm=errors_nm)
 
 
 def standard_error(values: Sequence[float]) -> float:
@@ -251,23 +262,26 @@ def judge_signs(
     *,
     emulated: bool = False,
 ) -> list[Line]:
-    """Return the lines on a turn: command, wrist, load cell, wrench and estimates have its sign, `way`.
+    """Return the lines on a turn in the direction `way`: the signs of command, wrist, load cell, wrench and estimates.
 
-    A device that shows less than its noise, or than a small fraction of the spring's torque, has no sign. A wrench that
-    is known only to `wrench_noise_nm` shows only the sign of a larger torque. A calibration on recordings of real
-    fingertips may refuse `emulated` frames.
+    A change within the noise, or within a small fraction of the spring's torque, has no sign. The sign of the wrench is
+    judged only for a torque beyond `wrench_noise_nm`. A calibration on recordings of real fingertips may refuse
+    `emulated` frames.
     """
     wanted = direction_of(way)
 
-    def compared(what: str, change: float, least: float, unit: str) -> Line:
-        found = direction_of(change) if abs(change) > least else None
-        return _sign_line(what, found or f"no change beyond {least:.2g} {unit}", wanted, passed=found == wanted)
+    def compared(what: str, change: float, smallest: float, unit: str) -> Line:
+        if abs(change) <= smallest:
+            return _sign_line(what, f"no change beyond {smallest:.2g} {unit}", wanted, passed=False)
+        direction = direction_of(change)
+        return _sign_line(what, str(direction), wanted, passed=direction == wanted)
 
     def noise_nm(source: str) -> float:
         return _NOISE_ERRORS * math.hypot(before.errors_nm.get(source, 0.0), after.errors_nm.get(source, 0.0))
 
     def torques_compared(what: str, source: str, change_nm: float) -> Line:
-        return compared(what, change_nm, max(_SHOWN_TORQUE * spring * TURN_RAD, noise_nm(source)), "N·m")
+        smallest_nm = max(_SHOWN_TORQUE * spring * TURN_RAD, noise_nm(source))
+        return compared(what, change_nm, smallest_nm, "N·m")
 
     is_right = said == wanted
     load_nm = after.load_nm - before.load_nm

@@ -44,9 +44,11 @@ def read_content(topic: str, data: bytes, columns: TopicColumns | None = None) -
         raise ContentError(f"it is not JSON ({error})") from error
     if not isinstance(content, dict):
         raise ContentError(f"it is {_quoted(content)}, not a map")
-    imported, expected = False, list(columns.all)
-    if name is not None and name in schema.IMPORTED_KEYS and not content.keys() & _LIVE_KEYS:
-        imported, expected = True, [*schema.IMPORTED_KEYS[name], *columns.unknown]
+    imported = name in schema.IMPORTED_KEYS and not content.keys() & _LIVE_KEYS
+    if name is not None and imported:
+        expected = [*schema.IMPORTED_KEYS[name], *columns.unknown]
+    else:
+        expected = list(columns.all)
     allowed = columns.recorded.keys() & {*expected}
     if other := [key for key in content if key not in allowed]:
         raise ContentError(f"it has the unknown key {_quoted(other[0])}")

@@ -3,7 +3,7 @@
 A recording holds the schema that its writer used, so a message is read by the schema of its file. A key of this version
 that the file's schema lacks has no value. A key that only the file's schema has keeps its name, its type and its unit.
 So does each key of a topic that this version does not have. A key with another type or unit than this version's is
-exported as it was recorded, and nothing computes with it.
+exported as it was recorded, and no command computes with it.
 """
 
 import re
@@ -26,20 +26,20 @@ _LARGEST_SCHEMA_BYTES = 256 << 10
 _MOST_KEYS = 1000
 # Keys become names of columns in files, also in MATLAB's.
 _KEY = re.compile(r"[a-z][a-z0-9_]{0,58}", re.ASCII)
-# Topics that this version does not have become names too, of files and of MATLAB's variables.
+# Topics that this version does not have become names of files and of MATLAB's variables.
 _TOPIC = re.compile(r"[a-z][a-z0-9_]{0,30}(\.[A-Za-z0-9_-]{1,60}){0,3}", re.ASCII)
-# The table of the units in an export.
-_NO_TOPIC = "units"
+# An export has a table of this name.
+_UNITS_TABLE = "units"
 _LOG_TIME = "log_time_ns"
 _LONGEST_UNIT = 20
-# Earlier schemas have the unit only here.
+# Earlier versions wrote the unit only at the end of the description.
 _UNIT_IN_DESCRIPTION = re.compile(rf"\(([^()]{{1,{_LONGEST_UNIT}}})\)$")
-# The times whose unit no schema has.
+# No schema declares the units of these times.
 _TIMES = {
     **dict.fromkeys((_LOG_TIME, "t_mono_ns", "offset_ns", schema.ARRIVAL, schema.SUSPENDED), "ns"),
     "timestamp": "s",
 }
-# The bank's model decides between the units of these; earlier versions declared one, or both.
+# The unit of these keys depends on the bank's model. Earlier versions declared one unit, or both.
 _UNITS_OF_K = frozenset({"", "cm", "cm or rad/cm"})
 _KEYS_OF_K = frozenset({"k", "k_low", "k_high"})
 
@@ -67,9 +67,9 @@ class TopicColumns:
 
     # The name of its schema in this version, None for a topic that this version does not have.
     name: str | None
-    # Those of this version, in the order of its schema; of a topic that it does not have, the envelope's.
+    # This version's columns, in the order of its schema. A topic that it does not have has only the envelope's columns.
     own: Mapping[str, Column]
-    # Those of the file's schema, in its order.
+    # The columns of the file's schema, in its order.
     recorded: Mapping[str, Column]
 
     @cached_property
@@ -144,7 +144,7 @@ def own_name(topic: str) -> str | None:
 
 @cache
 def own_topic(name: str) -> TopicColumns:
-    """Return the columns of a topic whose file has the schema of this version, or none."""
+    """Return the columns of a topic, for a file with this version's schema or without a schema."""
     return TopicColumns(name, own_columns(name), own_columns(name))
 
 
@@ -154,7 +154,7 @@ def recorded_topic(topic: str, written: Schema | None) -> TopicColumns:
     Raises SchemaError for a schema that no version writes, and for a topic that only a schema would describe.
     """
     name = own_name(topic)
-    if name is None and (not _TOPIC.fullmatch(topic) or topic == _NO_TOPIC):
+    if name is None and (not _TOPIC.fullmatch(topic) or topic == _UNITS_TABLE):
         raise SchemaError(f"no version has a topic {topic[:40]!r}")
     if written is None:
         if name is None:
@@ -228,7 +228,7 @@ def _unit(key: str, definition: Mapping[str, Any]) -> Any:
 
 
 def _difference(recorded: Column, own: Column) -> str:
-    """Return in which type or unit a key was recorded, if it is not this version's; else ""."""
+    """Return how the type or unit of a recorded key differs from this version's, or "" if neither differs."""
     if recorded.kind != own.kind and (recorded.kind, own.kind) != ("integer", "number"):
         return f"as {recorded.kind}, not {own.kind}"
     if recorded.unit == own.unit or (own.name in _KEYS_OF_K and recorded.unit in _UNITS_OF_K):

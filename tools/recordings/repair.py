@@ -29,7 +29,7 @@ class RepairResult:
     damaged_attachments: int
     # Lost messages by topic, as far as the file shows them.
     lost: dict[str, int]
-    # Whether a program was writing the source: the copy has what was there then.
+    # Whether a program was writing the source: the copy has the content of that moment.
     being_written: bool
     # Whether a part of the source, or its index, was missing or damaged.
     was_damaged: bool

@@ -162,9 +162,8 @@ def _described(topic: str, written: Schema | None) -> tuple[TopicSummary, TopicC
         return TopicSummary(problem=str(error)), None
     if columns.name is None:
         return TopicSummary(known=False), columns
-    return TopicSummary(
-        not_recorded=columns.not_recorded, unknown=columns.unknown, differing=dict(columns.differing)
-    ), columns
+    differing = dict(columns.differing)
+    return TopicSummary(not_recorded=columns.not_recorded, unknown=columns.unknown, differing=differing), columns
 
 
 def _clock_reading(message: Message, columns: TopicColumns | None) -> ClockReading | None:

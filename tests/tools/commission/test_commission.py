@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from shearloop.cli import main, other_daemon
-from shearloop.cli.commission import naming
+from shearloop.cli.commission import how_to_configure
 from shearloop.daemon.commissioning_report import Line, Report, RigIdentity, StageResult
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.refusals import Refusals
@@ -340,7 +340,7 @@ def test_the_line_that_names_the_report_is_as_the_configuration_needs_it(tmp_pat
     monkeypatch.chdir(tmp_path)
     (tmp_path / "my-rig").mkdir()
     path = write_rig(tmp_path / "my-rig")
-    named = naming(Path(out), path.relative_to(tmp_path), rehearsed=False)
+    named = how_to_configure(Path(out), path.relative_to(tmp_path), rehearsed=False)
     assert named == line.format(tmp_path)
     path.write_text(path.read_text() + named.split("`")[1] + "\n")
     assert load_daemon_config(path).commissioned == tmp_path / out

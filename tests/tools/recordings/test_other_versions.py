@@ -315,8 +315,10 @@ def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(
     check_tables(one, out, ran)
     check_rerun(one, out, ran)
     assert shearloop.read(path).units("load.torque")["torque_nm"] == "mN·m"
-    recorded_so = "torque_nm in mN·m, not in N·m"
-    assert f"load.torque was recorded with {recorded_so}: tables have it so" in ran("recording", "info", path).out
+    recorded_so = "in mN·m, not in N·m"
+    assert (
+        f"load.torque was recorded with torque_nm {recorded_so}: tables have this" in ran("recording", "info", path).out
+    )
     parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     ran("recording", "export", path, "--format", "lerobot", "--out", out / "lerobot")
     load = parquet.read_table(out / "lerobot/data/chunk-000/file-000.parquet")["observation.load"].to_pylist()
@@ -326,7 +328,7 @@ def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(
     sent, _ = asyncio.run(replayed(path, math.inf, load_daemon_config(config())))
     assert {content["torque_nm"] for topic, content in sent if topic == "load.torque"} == {None}
     said = ran("recording", "replay", path, "--config", config(), "--publish", f"ipc://{tmp_path}/r", "--speed", "max")
-    assert f"with {recorded_so}, of load.torque: no value is sent there" in said.err
+    assert f"with torque_nm of load.torque {recorded_so}: no value is sent there" in said.err
 
 
 def test_each_table_has_the_recorded_unit_of_keys_and_topics_of_other_versions(source, tmp_path, ran):

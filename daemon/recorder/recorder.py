@@ -359,8 +359,12 @@ class Recorder:
 
         `states_follow`: the states of all sources were asked for when the next item was queued.
         """
-        self._current.file.free_if_deleted()
-        # What cannot be written into a removed file keeps no new one from beginning.
+        try:
+            self._current.file.free_if_deleted()
+        except OSError as error:
+            # The new file may still have room.
+            self._failing = f"{self.path}: {error.strerror}"
+        # A removed file that cannot be written does not prevent a new one.
         if not self._flush() and not self._current.file.is_removed():
             return
         previous, lost = self._current, dropped + self._counts.unwritable

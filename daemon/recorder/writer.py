@@ -185,7 +185,7 @@ class McapFile:
             return True
 
     def free_if_deleted(self) -> None:
-        """Give the disk's room back if the file was deleted: until it is closed it takes as much as before.
+        """Give the room on the disk back if the file was deleted, before it is closed; raises OSError.
 
         A file that was only moved stays as it is.
         """

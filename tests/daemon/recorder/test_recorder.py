@@ -28,6 +28,7 @@ from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, LoopState,
 from shearloop.daemon.recorder import recorder as recorder_module
 from shearloop.daemon.recorder.recorder import AttachedFile, Identity, Recorder, slug_of
 from shearloop.daemon.recorder.schema import basic_identity
+from shearloop.daemon.recorder.writer import McapFile
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.tools.recordings.frames import read_recording
@@ -480,6 +481,24 @@ def test_deleting_the_recordings_makes_room_on_a_full_disk(small_disk):
     recorder.path.unlink()
     recorder.write()
     recorder.record_message("load.torque", torque(1))
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    (path,) = recorder.closed_files
+    assert [one["seq"] for one in topics(path)["load.torque"]] == [1]
+
+
+def test_a_deleted_recording_whose_room_stays_taken_ends_no_recording(tmp_path, monkeypatch):
+    def refuse(_: McapFile) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    recorder = Recorder(tmp_path, IDENTITY, Clock())
+    recorder.path.unlink()
+    monkeypatch.setattr(McapFile, "free_if_deleted", refuse)
+    recorder.record_message("load.torque", torque(1))
+    recorder.write()
+    assert recorder.failure
+    assert recorder.path.exists()
     recorder.write()
     assert recorder.failure == ""
     recorder.close()

@@ -304,9 +304,12 @@ def with_definition(source: Path, out: Path, topic: str, key: str, changes: Row)
     return rewritten(source, out, described)
 
 
-@pytest.mark.parametrize(
+OTHER_UNIT = pytest.mark.parametrize(
     "changes", [{"unit": "mN·m"}, {"unit": None, "description": "the torque (mN·m)"}], ids=["unit", "description"]
 )
+
+
+@OTHER_UNIT
 def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(changes, source, config, tmp_path, ran):
     path = with_definition(source, tmp_path / "x.mcap", "load.torque", "torque_nm", changes)
     one = Recorded(path, [], replayable=False)
@@ -319,10 +322,6 @@ def test_a_key_with_another_unit_is_exported_in_it_and_nothing_computes_with_it(
     assert (
         f"load.torque was recorded with torque_nm {recorded_so}: tables have this" in ran("recording", "info", path).out
     )
-    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
-    ran("recording", "export", path, "--format", "lerobot", "--out", out / "lerobot")
-    load = parquet.read_table(out / "lerobot/data/chunk-000/file-000.parquet")["observation.load"].to_pylist()
-    assert np.isnan(np.array(load)[:, 0]).all()
     with pytest.raises(UserError, match=r"needs the key 'torque_nm' of load.torque, which was recorded in mN·m, not"):
         read_recording(path)
     sent, _ = asyncio.run(replayed(path, math.inf, load_daemon_config(config())))
@@ -356,6 +355,15 @@ def test_no_chart_of_rerun_draws_a_torque_in_another_unit(source, tmp_path, monk
     ran("recording", "export", path, "--format", "rrd", "--out", tmp_path / "a.rrd")
     assert "robot/state/wrist_torque_nm" in charts["torque (N·m)"]
     assert not any("load/torque/torque_nm" in chart for chart in charts.values())
+
+
+@OTHER_UNIT
+def test_a_key_with_another_unit_has_no_value_in_a_data_set_of_lerobot(changes, source, tmp_path, ran):
+    parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    path = with_definition(source, tmp_path / "x.mcap", "load.torque", "torque_nm", changes)
+    ran("recording", "export", path, "--format", "lerobot", "--out", tmp_path / "lerobot")
+    load = parquet.read_table(tmp_path / "lerobot/data/chunk-000/file-000.parquet")["observation.load"].to_pylist()
+    assert np.isnan(np.array(load)[:, 0]).all()
 
 
 def test_another_unit_of_a_needed_key_refuses_slices_and_replay(source, tmp_path, mistake):

@@ -637,12 +637,14 @@ def test_a_grip_that_needs_an_activation_is_refused_at_the_start(sense, holds):
     rig.force_n = 60.0 if holds else 0.0
     rig.run(0.1)
     start = rig.control_loop.start
-    file, after_release = (
-        ExperimentFile.model_validate({"name": "test", "steps": [*first, GRIP]}) for first in ([], [{"do": "release"}])
-    )
+    file = ExperimentFile.model_validate({"name": "test", "steps": [GRIP]})
     assert "step 1 (grip)" in start(file, rig.t_ns, confirmed=True)
+    after_release = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release"}, GRIP]})
     asked = start(after_release, rig.t_ns)
-    assert asked is None or asked.startswith(f"step 1 {OPENS}")
+    if holds:
+        assert asked.startswith(f"step 1 {OPENS}")
+    else:
+        assert asked is None
 
 
 @pytest.mark.parametrize(

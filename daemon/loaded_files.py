@@ -47,8 +47,8 @@ class _Loaded(NamedTuple):
 class LoadedFiles:
     """The configuration, the files that it names, and the daemon's code, as they were when the daemon began.
 
-    The daemon reads them once. A limit that is lowered in one of them later does not hold until a restart. Of the code,
-    some modules are loaded with the first experiment: after an upgrade in place they would be of another version.
+    The daemon reads them once. A limit that is lowered in one of them later does not hold until a restart. Some modules
+    of the code are loaded with the first experiment. After an upgrade in place they would be of another version.
     """
 
     def __init__(self, paths: Iterable[Path]) -> None:

@@ -273,7 +273,7 @@ class ControlLoop:
     ) -> str | None:
         """Return why an experiment cannot begin, or None; `confirmed`: a held tool may drop.
 
-        `is_enabled`: the arm has been enabled for it, else it will be.
+        `is_enabled`: the arm has been enabled for the experiment. Else it will be, and what that ends refuses nothing.
         """
         if (reason := self.operator.start_refusal()) is not None:
             return reason
@@ -288,7 +288,7 @@ class ControlLoop:
     def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:
         """Begin an experiment; return None, or why it cannot begin; `confirmed` is as in `refusal_of`."""
         if self.running_experiment is None and self.inputs.gripper is not None:
-            # What other programs asked for before the start is no fault of this experiment.
+            # Requests of other programs before the start are no fault of this experiment.
             self.tool.judge(self.inputs.gripper)
         if (reason := self.refusal_of(file, t_ns, confirmed=confirmed)) is not None:
             return reason
@@ -375,9 +375,9 @@ class ControlLoop:
         )
 
     def _lacks_zero(self, running: Experiment) -> bool:
-        """Return whether the present step needs a zero of the driving torque that is not known.
+        """Return whether the present step needs a zero of the driving torque, and it is not known.
 
-        As at the start, a clamped tool may be turned back by a `turn_to` without one.
+        As at the start, a `turn_to` of a clamped tool needs none: it is the way to turn the tool back.
         """
         driving = self.wrist.source
         turns_back = isinstance(running.step, TurnToStep) and not self.tool.has_gripper
@@ -407,7 +407,7 @@ class ControlLoop:
         return [fault for fault in faults if not (enabled and fault.code is FaultCode.ROBOT_BLOCKED)]
 
     def _lasting(self, faults: Sequence[Fault]) -> list[Fault]:
-        """Return the faults that a start meets once the arm is enabled: a pause of the loop is over by then."""
+        """Return the faults that remain once the arm is enabled: a pause of the loop is over by then."""
         return [fault for fault in self._unless_enabled_by_start(faults) if not fault.rule.is_past]
 
     def _awaited_judgement(self) -> str | None:

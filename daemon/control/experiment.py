@@ -19,7 +19,7 @@ from shearloop.daemon.torques import SIGNS
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
-# A ramp has ended at its set point but for rounding.
+# A ramp this close to its set point has ended: the difference comes from rounding.
 RAMPED_NM = 1e-9
 
 
@@ -60,7 +60,7 @@ Action: TypeAlias = steps.ApproachStep | steps.GripStep | steps.TareStep | steps
 
 @dataclass(frozen=True, slots=True)
 class StepContext:
-    """Input of a step: the wrist joint's angle now and at the grip, the driving torque, and where its ramp is.
+    """Input of a step: the wrist joint's angle now and at the grip, the driving torque, and the present ramp.
 
     `torque_nm` is None without a fresh valid estimate, `ramp_nm` without a closed loop. `elapsed_s` is the experiment's
     time.
@@ -108,7 +108,7 @@ class Experiment:
     """One run of an experiment file."""
 
     def __init__(self, file: ExperimentFile, t_ns: int, speeds: Speeds = AS_ASKED, start: KnownTool = AT_REST) -> None:
-        """Begin at t_ns; `speeds` are the largest that the rig allows, `start` is what is known of the tool."""
+        """Begin at t_ns; `speeds` are the largest that the rig allows, `start` is the known state of the tool."""
         self.file = file
         # The approximate duration of each step, for the remaining time shown to the operator.
         self._expected_s = [one.takes_s for one in demands(file, speeds, start)]
@@ -314,7 +314,7 @@ def _hold_torque(step: steps.HoldTorqueStep) -> StepProgram:
         context = yield StepCommand(track, activity=f"bringing the torque to {torque_nm:+.3f} N·m")
         if context.torque_nm is None or context.ramp_nm is None:
             continue
-        # The hold counts from the ramp's end, not from where the torque comes near it.
+        # The hold counts from the end of the ramp. The torque comes within the tolerance before.
         ramped = math.isclose(context.ramp_nm, torque_nm, abs_tol=RAMPED_NM)
         if ramped and abs(context.torque_nm - torque_nm) <= tolerance_nm:
             break

@@ -57,7 +57,7 @@ class RunningStep:
 
     # The wrist is driven by the torque, or twists under its limit.
     torque_needed: bool
-    # Whether the driving torque needs a zero, and it is not known.
+    # Whether the step needs a zero of the driving torque, and it is not known.
     lacks_zero: bool
     grasp: Grasp
     twisted_rad: float

@@ -1,13 +1,13 @@
 """The known angle and torque of a tool after each step of an experiment, before it runs.
 
-An angle or a torque is known exactly, within an interval, or not at all. Of the tool these facts are used, and no more:
+An angle or a torque is known exactly, within an interval, or not at all. These facts about the tool are assumed:
 
-- A turn in one direction does not turn the torque to the other one. How much the torque rises is not known: the tool
-  springs with an unknown stiffness, slips, or breaks loose.
+- A turn in one direction does not load the tool in the other one. The size of the change of torque is not known: the
+  tool has an unknown stiffness, and may slip or break loose.
 - To raise a torque (counterclockwise is positive), the wrist turns counterclockwise; to lower it, clockwise.
-- While the wrist stands, the torque may fall towards 0. Under a held torque, the tool may creep on in its direction.
+- While the wrist stands, the torque may fall towards 0. Under a held torque, the tool may creep in its direction.
 - `identify` turns counterclockwise, ends where it began, and refuses a tool that slips.
-- A straight line may turn wrist 3, by which the angle from the grip counts.
+- A straight line may turn wrist 3. The angle from the grip is measured by this joint.
 """
 
 import math
@@ -36,10 +36,10 @@ from shearloop.daemon.torques import SIGNS, Direction, direction_of
 UNTURNED_RAD: Final = 0.02
 # A torque counts as reached within this fraction of the set point: the closed loop's accuracy.
 TORQUE_TOLERANCE: Final = 0.10
-# Smaller differences are of rounding.
+# Smaller differences come from rounding.
 _ROUNDING: Final = 1e-9
 
-# The directions in which something may turn; None: it may not turn at all.
+# The possible directions of a turn. None among them: possibly there is no turn.
 Ways: TypeAlias = frozenset[Direction | None]
 STILL: Final[Ways] = frozenset({None})
 _OPPOSITE: Final[dict[Direction, Direction]] = {"clockwise": "counterclockwise", "counterclockwise": "clockwise"}
@@ -51,7 +51,7 @@ def way_from(start: float, end: float) -> Direction | None:
 
 
 def opposite(ways: Ways) -> Ways:
-    """Return the opposite directions; the opposite of no turn is left out."""
+    """Return the opposite directions; None has no opposite."""
     return frozenset(_OPPOSITE[way] for way in ways if way is not None)
 
 
@@ -67,28 +67,28 @@ class Interval(NamedTuple):
         return self.low if self.low == self.high else None
 
     def ways_to(self, value: float) -> Ways:
-        """Return in which directions another value may lie."""
+        """Return the possible directions from this value to another."""
         ends = {way_from(self.low, value), way_from(self.high, value)}
         return frozenset(ends | STILL) if len(ends) > 1 else frozenset(ends)
 
     def plus(self, other: "Interval") -> "Interval":
-        """Return the sum of a value of each."""
+        """Return the possible sums of a value of this interval and one of the other."""
         return Interval(self.low + other.low, self.high + other.high)
 
     def up_to(self, value: float) -> "Interval":
-        """Return the smallest interval that has these values and another one."""
+        """Return the smallest interval that contains this one and a value."""
         return Interval(min(self.low, value), max(self.high, value))
 
     def beyond(self, ways: Ways) -> "Interval":
-        """Return the values after changes of unknown extent in these directions."""
+        """Return the possible values after changes of unknown size in these directions."""
         low = -math.inf if "clockwise" in ways else self.low
         high = math.inf if "counterclockwise" in ways else self.high
         return Interval(low, high)
 
-    def within(self, most: float) -> "Interval":
-        """Return the values that are at most `most` in magnitude; all such values if none of these is."""
-        low, high = max(self.low, -most), min(self.high, most)
-        return Interval(low, high) if low <= high else Interval(-most, most)
+    def within(self, bound: float) -> "Interval":
+        """Return the part of this interval from -`bound` to `bound`; all of that range if they do not overlap."""
+        low, high = max(self.low, -bound), min(self.high, bound)
+        return Interval(low, high) if low <= high else Interval(-bound, bound)
 
 
 def exactly(value: float) -> Interval:
@@ -96,7 +96,7 @@ def exactly(value: float) -> Interval:
     return Interval(value, value)
 
 
-NONE: Final = exactly(0.0)
+ZERO: Final = exactly(0.0)
 UNKNOWN: Final = Interval(-math.inf, math.inf)
 
 
@@ -110,15 +110,16 @@ class Held(Enum):
 
 @dataclass(frozen=True, slots=True)
 class KnownTool:
-    """The known state between two steps; `origin_rad` is the wrist joint's angle at which the tool's angle is 0.
+    """The known state between two steps."""
 
-    `last_nm` is the torque that a step has asked for last in this grip, the likely one where it is not known.
-    """
-
-    angle_rad: Interval = NONE
-    torque_nm: Interval = NONE
+    # The tool's angle from the grip.
+    angle_rad: Interval = ZERO
+    torque_nm: Interval = ZERO
+    # The latest torque that a step has asked for in this grip: the likely torque where `torque_nm` is not exact.
     last_nm: float = 0.0
+    # The wrist joint's angle.
     wrist_rad: Interval = UNKNOWN
+    # The wrist joint's angle at which the tool's angle is 0; None if it is not known.
     origin_rad: float | None = None
     held: Held = Held.MAYBE
 
@@ -138,32 +139,32 @@ class KnownTool:
         return self._turned(angle_rad, exactly(wrist_rad), self._loaded(ways))
 
     def ways_of_wrist(self, wrist_rad: float) -> Ways:
-        """Return in which directions an angle of the wrist joint may lie."""
+        """Return the possible directions of a turn to an angle of the wrist joint."""
         if self.origin_rad is not None:
             return self.angle_rad.ways_to(wrist_rad - self.origin_rad)
         return self.wrist_rad.ways_to(wrist_rad)
 
     def returned(self, ways: Ways) -> "KnownTool":
-        """Return the known state after a turn in one of these directions, and back: slip may turn the torque back."""
+        """Return the known state after a turn there and back: slip may leave a torque in the opposite direction."""
         return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(opposite(ways)))
 
     def torque_brought_to(self, torque_nm: float) -> "KnownTool":
-        """Return the known state after a turn until the torque has a value, and while it was held."""
+        """Return the known state after the torque was brought to a value and held."""
         turns = self.torque_nm.ways_to(torque_nm)
         creeps: Ways = frozenset({direction_of(torque_nm)})
         return replace(self._turned_beyond(turns | creeps, exactly(torque_nm)), last_nm=torque_nm)
 
     def tightened(self, step: TightenStep, *, reaches: bool) -> "KnownTool":
-        """Return the known state after a `tighten`; `reaches`: it ends near its torque or beyond, not at its angle."""
+        """Return the known state after a `tighten`; `reaches`: it ended at its torque or beyond, not at its angle."""
         sign, ways = SIGNS[step.direction], frozenset({step.direction})
         until_nm = sign * (1.0 - TORQUE_TOLERANCE) * step.until_torque_nm
         torque_nm = exactly(until_nm).beyond(ways) if reaches else self._loaded(ways)
-        by_rad = NONE.up_to(sign * step.until_angle_rad)
+        by_rad = ZERO.up_to(sign * step.until_angle_rad)
         turned = self._turned(self.angle_rad.plus(by_rad), self.wrist_rad.plus(by_rad), torque_nm)
         return replace(turned, last_nm=sign * step.until_torque_nm)
 
     def gripped(self, step: GripStep) -> "KnownTool":
-        """Return the known state after the fingers have closed; a held tool is gripped tighter and keeps its angle."""
+        """Return the known state after the fingers have closed: a tool that was held before keeps its angle."""
         held = Held.YES if step.expect_object else Held.MAYBE
         another = KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=held)
         if self.held is Held.NO:
@@ -173,7 +174,7 @@ class KnownTool:
         if self.held is Held.YES:
             return replace(tighter, held=Held.YES)
         angle_rad = self.angle_rad.up_to(0.0)
-        was_unturned = self.angle_rad == NONE
+        was_unturned = self.angle_rad == ZERO
         origin_rad = self.origin_rad if was_unturned else None
         return replace(tighter, held=held, angle_rad=angle_rad, origin_rad=origin_rad)
 
@@ -182,12 +183,12 @@ class KnownTool:
         return KnownTool(wrist_rad=self.wrist_rad, origin_rad=self.wrist_rad.exact, held=Held.NO)
 
     def tared(self) -> "KnownTool":
-        """Return the known state after a tare; it is refused with a held tool that is not clamped, or is turned."""
+        """Return the known state after a tare: it is refused with a gripped tool, and with a turned clamped one."""
         angle_rad = self.angle_rad if self.held is Held.NO else self.angle_rad.within(UNTURNED_RAD)
-        return replace(self, angle_rad=angle_rad, torque_nm=NONE, last_nm=0.0)
+        return replace(self, angle_rad=angle_rad, torque_nm=ZERO, last_nm=0.0)
 
     def moved(self) -> "KnownTool":
-        """Return the known state after a straight line, which may turn wrist 3 and load a held tool."""
+        """Return the known state after a straight line: it may turn wrist 3 and load a held tool."""
         torque_nm = self.torque_nm if self.held is Held.NO else UNKNOWN
         return replace(self, angle_rad=UNKNOWN, wrist_rad=UNKNOWN, torque_nm=torque_nm)
 
@@ -196,19 +197,19 @@ class KnownTool:
         return replace(self, torque_nm=self.torque_nm.up_to(0.0))
 
     def rescaled(self) -> "KnownTool":
-        """Return the known state after a change of the measured torque's scale: only its direction stays."""
+        """Return the known state after a change of the measured torque's scale: only its direction is still known."""
         load_ways = opposite(self.torque_nm.ways_to(0.0))
         return replace(self, torque_nm=self.torque_nm.up_to(0.0).beyond(load_ways))
 
     def _loaded(self, ways: Ways) -> Interval:
-        """Return the torque after a turn in one of these directions; a tool that breaks loose may lose all of it."""
+        """Return the possible torques after a turn in one of these directions: the tool may break loose."""
         return self.torque_nm.up_to(0.0).beyond(ways)
 
     def _turned_beyond(self, ways: Ways, torque_nm: Interval) -> "KnownTool":
         return self._turned(self.angle_rad.beyond(ways), self.wrist_rad.beyond(ways), torque_nm)
 
     def _turned(self, angle_rad: Interval, wrist_rad: Interval, torque_nm: Interval) -> "KnownTool":
-        """Return the known state with another angle: the wrist joint's angle and the tool's differ by the origin."""
+        """Return the known state at another angle. The wrist joint's angle is the tool's angle plus the origin."""
         origin_rad = self.origin_rad
         if origin_rad is not None:
             wrist_rad = angle_rad.plus(exactly(origin_rad))
@@ -217,27 +218,28 @@ class KnownTool:
         return replace(self, angle_rad=angle_rad, wrist_rad=wrist_rad, torque_nm=torque_nm, origin_rad=origin_rad)
 
 
-# A tool as a fresh grip leaves it, and one of which nothing is known.
+# The state after a new grip, and a state of which nothing is known.
 AT_REST: Final = KnownTool()
 NOTHING_KNOWN: Final = KnownTool(angle_rad=UNKNOWN, torque_nm=UNKNOWN)
 
 
 def known_at_start(*, loaded: bool, twisted_rad: float, wrist_rad: float | None = None) -> KnownTool:
-    """Return the known state at a start; `loaded`: a tool may be held, turned by about `twisted_rad` since its grip.
+    """Return the known state at a start.
 
-    `wrist_rad` is where the wrist joint stands; None: it is not known.
+    `loaded`: a tool may be held, and is turned by about `twisted_rad` since its grip. `wrist_rad` is the wrist joint's
+    angle, None if it is not known.
     """
-    stands_rad = UNKNOWN if wrist_rad is None else exactly(wrist_rad)
+    wrist_bounds_rad = UNKNOWN if wrist_rad is None else exactly(wrist_rad)
     if not loaded:
-        return replace(AT_REST, wrist_rad=stands_rad, origin_rad=wrist_rad)
+        return replace(AT_REST, wrist_rad=wrist_bounds_rad, origin_rad=wrist_rad)
     angle_rad = UNKNOWN if abs(twisted_rad) > UNTURNED_RAD else UNKNOWN.within(UNTURNED_RAD)
-    return replace(NOTHING_KNOWN, angle_rad=angle_rad, wrist_rad=stands_rad)
+    return replace(NOTHING_KNOWN, angle_rad=angle_rad, wrist_rad=wrist_bounds_rad)
 
 
 def known_after(step: Step, known: KnownTool, *, reaches: bool = True) -> KnownTool:
     """Return the known state after a step, from the one before it."""
     if isinstance(step, TwistingStep) and known.held is Held.NO:
-        # Something else than the fingers may hold it.
+        # Not only the fingers can hold a tool: it may be clamped.
         known = replace(known, held=Held.MAYBE)
     match step:
         case TurnToStep(angle_rad=angle_rad):

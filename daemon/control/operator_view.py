@@ -1,6 +1,6 @@
 """The operator's commands: why each one is refused at present, and which question comes before it.
 
-The questions before a release and an unlock are here, so that they are loaded with the rig: a way out must not depend
+The questions before a release and an unlock are here, so that they are loaded with the rig. A way out must not depend
 on files that an upgrade in place has replaced.
 """
 

@@ -114,7 +114,7 @@ class SafetyMonitor:
         active = self._active = tuple(faults)
         self._reset_timers()
         for fault in active:
-            # One that lasts is one cause, in its first words: while it is unlocked, the robot says how far it is.
+            # A fault that lasts is one cause and keeps its first words. During an unlock the robot reports progress.
             lasts = fault.code in before and self._waiting_fault(fault.code) is not None
             if fault.rule.stops_at_rest and not lasts:
                 self._causes += 1
@@ -124,7 +124,7 @@ class SafetyMonitor:
     def stop(self, fault: Fault) -> None:
         """Begin a stop that no input shows, such as an operator's; it keeps the grip, and a stronger one stays."""
         self._causes += 1
-        # A further stop of an arm that stands does not hide what the first one stopped.
+        # A further stop of an arm that stands does not hide the cause of the first one.
         self._join(self._waiting_fault(fault.code) or fault)
 
     def _waiting_fault(self, code: FaultCode) -> Fault | None:
@@ -182,15 +182,18 @@ class SafetyMonitor:
         active_codes = {fault.code for fault in active}
         # In the order of the stop, so that its cause stays first.
         stop_codes = list(dict.fromkeys(fault.code for fault in stop.faults))
-        # What a present fault of a device hides comes after it, as what it makes the robot refuse; else it is over.
-        of_device = bool(active_codes & _OF_DEVICES)
-        over_codes = set() if of_device else _SHOWN_AT_REST
-        hidden_codes = (_SHOWN_AT_REST - active_codes) | {FaultCode.COMMAND_REFUSED} if of_device else set()
+        over_codes: set[FaultCode] = set()
+        later_codes: set[FaultCode] = set()
+        if active_codes & _OF_DEVICES:
+            # It may hide the robot's other faults, and makes the robot refuse commands. Both are reported after it.
+            later_codes = (_SHOWN_AT_REST - active_codes) | {FaultCode.COMMAND_REFUSED}
+        else:
+            over_codes = _SHOWN_AT_REST
         kept = [replace(one, is_over=one.code in over_codes) for one in stop.faults if one.code not in active_codes]
         kept += [fault for fault in active if fault.code in stop_codes]
         kept.sort(key=lambda fault: stop_codes.index(fault.code))
         new = (fault for fault in active if fault.code not in stop_codes)
-        reported = sorted((*kept, *new), key=lambda fault: fault.code in hidden_codes)
+        reported = sorted((*kept, *new), key=lambda fault: fault.code in later_codes)
         return SafetyDecision(stop.response, cls._explained(tuple(reported), _explaining(stop.faults)))
 
     def _count(self, active: tuple[Fault, ...], t_ns: int) -> None:

@@ -28,7 +28,7 @@ from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, along_tool, turn_between
 from shearloop.drivers.ur.settings import UrLimits
 
-# The largest UR arm reaches as far.
+# The reach of the largest UR arm.
 _REACH_M: Final = 1.75
 # A motion of the fingers at their default speed, and the time to begin one and to see its end.
 _FINGERS_S, _BEGINS_S = 3.0, 0.7
@@ -43,8 +43,8 @@ _ACCURACY = 1.2
 class Demand(NamedTuple):
     """The largest torque (N·m) and angle from the grip (rad) of a step, its longest turn (rad), and its times.
 
-    It stands still for `stands_s` in all, and takes about `moves_s` for everything else, at most `longest_moves_s`.
-    `depends_on` is the unknown state from which it begins: its `moves_s` is a guess then. `turn_rad` is a bound then.
+    It stands still for `stands_s` in all. Everything else takes about `moves_s`, and at most `longest_moves_s`. Where
+    the step begins from an unknown state, `depends_on` names that state, `moves_s` is a guess, and `turn_rad` a bound.
     """
 
     torque_nm: float = 0.0
@@ -77,9 +77,10 @@ SETTLES_S: Final = 0.5
 
 
 class Before(NamedTuple):
-    """The known state before a step: the tool, and its pose, None for an unknown one; and what bounds the unknown."""
+    """The known state before a step, and the limits that bound the unknown one."""
 
     tool: KnownTool = AT_REST
+    # The tool's pose; None for an unknown one.
     pose_m_rad: Sequence[float] | None = None
     limit_nm: float = math.inf
     limit_rad: float = math.inf
@@ -131,12 +132,15 @@ def _line_s(step: ApproachStep, start: Sequence[float], end: Sequence[float], sp
 
 def _farthest_line_s(step: ApproachStep, pose: Sequence[float], speeds: Speeds, robot: UrLimits | None) -> float:
     """Return the time of the longest straight move to a pose: across the workspace, or the reach of the largest arm."""
-    farthest_m = math.hypot(*pose[:3]) + _REACH_M
+    place_m = pose[:3]
+    farthest_m = math.hypot(*place_m) + _REACH_M
     if robot is not None:
         box = robot.box
-        farthest_m = math.hypot(
-            *(max(abs(at - low), abs(high - at)) for at, low, high in zip(pose, box.lower_m, box.upper_m, strict=False))
-        )
+        farthest_by_axis_m = [
+            max(abs(at_m - low_m), abs(high_m - at_m))
+            for at_m, low_m, high_m in zip(place_m, box.lower_m, box.upper_m, strict=True)
+        ]
+        farthest_m = math.hypot(*farthest_by_axis_m)
     return max(farthest_m / min(step.speed_m_per_s, speeds.linear_m_per_s), math.pi / speeds.wrist_rad_per_s)
 
 
@@ -187,7 +191,7 @@ def demand(step: Step, speeds: Speeds = AS_ASKED, before: Before = NOTHING_BEFOR
 
 
 class _Start(NamedTuple):
-    """From where a step begins: the possible values of an angle or a torque, the likely one, and its name in words."""
+    """The angle or torque from which a step begins: its possible values, the likely value, and its name in words."""
 
     bounds: Interval
     likely: float
@@ -200,7 +204,7 @@ def _from_start(needs: Demand, step: HoldTorqueStep | TurnToStep | TwistStep, sp
     moves_s, turn_rad = _moves(step, start.likely, speeds)
     if start.bounds.exact is not None:
         return needs._replace(moves_s=moves_s, longest_moves_s=moves_s, turn_rad=turn_rad)
-    # Every distance is convex in its start, so that the longest one is from an end.
+    # Each distance is a convex function of the start, so the largest one is from an end of its bounds.
     from_ends = [_moves(step, end, speeds) for end in start.bounds]
     longest_s, longest_rad = (max(values) for values in zip(*from_ends, strict=True))
     return needs._replace(moves_s=moves_s, longest_moves_s=longest_s, turn_rad=longest_rad, depends_on=start.name)

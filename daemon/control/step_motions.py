@@ -64,8 +64,12 @@ def first_grip(file: ExperimentFile) -> tuple[int, GripStep] | None:
 
 
 def first_release(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the first step that opens the fingers on whatever they hold, or None.
+    """Return the number, from 1, of the first `release`, or None.
 
-    A `grip` never does: the gripper's task refuses one that would open them on a tool, or activate the gripper.
+    Only a `release` lets a tool drop. The gripper's task refuses a `grip` that would open the fingers on a tool, or
+    activate the gripper.
     """
-    return next((n for n, step in enumerate(file.steps, 1) if isinstance(step, ReleaseStep)), None)
+    for number, step in enumerate(file.steps, 1):
+        if isinstance(step, ReleaseStep):
+            return number
+    return None

@@ -1,4 +1,4 @@
-"""Which way each step of an experiment turns the tool, and which steps turn it back."""
+"""The directions in which each step of an experiment turns the tool, and the steps that turn it back."""
 
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -31,7 +31,7 @@ from shearloop.daemon.torques import BOTH_DIRECTIONS, Direction, direction_of
 
 
 def only_way(ways: Ways) -> Direction | None:
-    """Return the one direction of a turn, if there is a turn; None if both are possible, or none is."""
+    """Return the only possible direction of a turn; None if both directions are possible, or no turn is."""
     directions = ways - STILL
     return next(iter(directions)) if len(directions) == 1 else None
 
@@ -42,43 +42,44 @@ def either_way(ways: Ways) -> bool:
 
 
 def ways_between(values: Iterable[float]) -> list[Direction]:
-    """Return the directions of the turns from each angle to the next, in order; equal angles have no turn between."""
+    """Return the direction of each turn from angle to angle, in order; equal angles need no turn."""
     ways = (way_from(earlier, later) for earlier, later in pairwise(values))
     return [way for way in ways if way is not None]
 
 
 class Turn(NamedTuple):
-    """What a step turns: in which directions its first turn may be, and the last one of those that it leaves.
+    """The turns of one step."""
 
-    A step that returns to where it began leaves no turn. `loads` is the direction of the torque or the angle that it
-    leaves, None where that is as before. `asks_for` are those of all torques, or of all angles since the grip, that it
-    asks for. `may_load` are the directions of all torques that it may put on a held tool. `reach_rad` bounds the angle
-    since the grip; infinite where it is unknown. `turns_tool`: it turns a tool that is held, or may be. `by_angle`: it
-    does so by an angle, with a torque that is not known before.
-    """
-
+    # The possible directions of its first turn.
     begins: Ways
+    # The possible directions of the last turn. A step that returns to where it began counts as no turn.
     leaves: Ways
+    # The direction of the torque or the angle at its end; None where the step sets neither.
     loads: Direction | None
+    # The directions of all torques, or of all angles since the grip, that it asks for.
     asks_for: frozenset[Direction]
+    # The directions in which it may load a held tool.
     may_load: frozenset[Direction]
+    # The bounds of the angle since the grip during the step; infinite where it is not known.
     reach_rad: Interval
+    # Whether it turns a tool that is held, or may be held.
     turns_tool: bool
+    # Whether it turns that tool by an angle, so that the torque is not known before.
     by_angle: bool
 
     @property
     def direction(self) -> Direction | None:
-        """The direction of its first turn; None for none, or unknown."""
+        """The direction of its first turn; None if it does not turn, or if the direction is not known."""
         return only_way(self.begins)
 
     @property
     def way_unknown(self) -> bool:
-        """Whether it may turn the tool in either direction."""
+        """Whether its first turn may be in either direction."""
         return either_way(self.begins)
 
 
 def turns(file: ExperimentFile, start: KnownTool = AT_REST, *, reaches: bool = True) -> Iterator[Turn]:
-    """Yield what each step turns; `reaches`: each `tighten` ends at its torque or beyond, not at its angle."""
+    """Yield the turns of each step; `reaches`: each `tighten` ends at its torque or beyond, not at its angle."""
     known = start
     for step in file.steps:
         after = known_after(step, known, reaches=reaches)
@@ -129,10 +130,11 @@ def _asks_for(step: Step, before: KnownTool) -> frozenset[Direction]:
 
 
 def _may_load(step: Step, before: KnownTool, begins: Ways, asks_for: frozenset[Direction]) -> frozenset[Direction]:
-    """Return in which directions a step may load a held tool.
+    """Return the directions in which a step may load a held tool.
 
-    A step that asks for a torque turns the other way only to lower it. Any other turn counts in its own direction,
-    because a tool that has slipped is loaded the other way before the wrist is back.
+    A step that asks for a torque turns the other way only to lower the torque. Any other turn may load the tool in its
+    own direction. That includes a turn back: a tool that has slipped is unloaded before the wrist is back, and the rest
+    of the turn loads it the other way.
     """
     match step:
         case HoldTorqueStep() | TightenStep():
@@ -153,7 +155,7 @@ def _without_none(ways: Iterable[Direction | None]) -> frozenset[Direction]:
 
 
 def _begins(step: Step, before: KnownTool) -> Ways:
-    """Return in which directions the first turn of a step may be."""
+    """Return the possible directions of a step's first turn."""
     match step:
         case TurnToStep(angle_rad=angle_rad):
             return before.ways_of_wrist(angle_rad)
@@ -171,7 +173,10 @@ def _begins(step: Step, before: KnownTool) -> Ways:
 
 
 def _first_ways(to_first: Ways, angles_rad: tuple[float, ...]) -> Ways:
-    """Return the directions of a twist's first turn; it is to a later angle if the tool stands at the first one."""
+    """Return the possible directions of a twist's first turn, from those to its first angle.
+
+    If the tool is at the first angle already, its first turn is to a later angle.
+    """
     if None not in to_first:
         return to_first
     later_ways = ways_between(angles_rad)
@@ -180,7 +185,7 @@ def _first_ways(to_first: Ways, angles_rad: tuple[float, ...]) -> Ways:
 
 
 def _tightens(direction: Direction, until_nm: float, torque_nm: Interval) -> Ways:
-    """Return whether a `tighten` turns: it does not where its torque is reached already."""
+    """Return the possible directions of a `tighten`: it does not turn where its torque is reached already."""
     weakest_nm, strongest_nm = torque_nm.low, torque_nm.high
     if direction == "clockwise":
         weakest_nm, strongest_nm = -torque_nm.high, -torque_nm.low
@@ -190,7 +195,7 @@ def _tightens(direction: Direction, until_nm: float, torque_nm: Interval) -> Way
 
 
 def _reach(step: TwistStep, before: KnownTool, after: KnownTool) -> Interval:
-    """Return the bounds of the angle since the grip in a twist."""
+    """Return the bounds of the angle since the grip during a twist."""
     angles_rad = _since_grip(step, before)
     if angles_rad is None:
         return after.angle_rad
@@ -198,7 +203,10 @@ def _reach(step: TwistStep, before: KnownTool, after: KnownTool) -> Interval:
 
 
 def _since_grip(step: TwistStep, before: KnownTool) -> tuple[float, ...] | None:
-    """Return the angles of a twist from the grip; None for those of a wrist joint whose angle there is not known."""
+    """Return a twist's angles since the grip.
+
+    None for angles of the wrist joint, if the joint's angle at the grip is not known.
+    """
     if not step.absolute:
         return step.angles_rad
     origin_rad = before.origin_rad
@@ -206,13 +214,13 @@ def _since_grip(step: TwistStep, before: KnownTool) -> tuple[float, ...] | None:
 
 
 def _last_way(angles_rad: tuple[float, ...]) -> Direction | None:
-    """Return the direction of the last turn from angle to angle; None where all are one."""
+    """Return the direction of the last turn from angle to angle; None where all angles are equal."""
     ways = ways_between(angles_rad)
     return ways[-1] if ways else None
 
 
 class Reversal(NamedTuple):
-    """A step that turns a held tool back: the numbers, from 1, of it and of the step before, and both directions."""
+    """A step that turns a held tool back, and the earlier step: their numbers, from 1, and their directions."""
 
     number: int
     direction: Direction
@@ -220,14 +228,14 @@ class Reversal(NamedTuple):
     direction_before: Direction
 
     def sentence(self, file: ExperimentFile) -> str:
-        """Return what turns back what."""
+        """Return the reversal in words."""
         return (
             f"reversal: {file.steps[self.number - 1].do} turns {self.direction}, against {self._before(file)}, which "
             f"turned {self.direction_before}"
         )
 
     def possible_sentence(self, file: ExperimentFile) -> str:
-        """Return what may turn back what: one of the two steps may not turn at all."""
+        """Return the reversal in words, where one of the two steps possibly does not turn at all."""
         step, against = file.steps[self.number - 1], f"the {self.direction_before} turn of {self._before(file)}"
         return f"may turn back: {step.do} may turn {self.direction}, against {against}"
 
@@ -243,13 +251,12 @@ class _EarlierTurn(NamedTuple):
 
 
 class Reversals(NamedTuple):
-    """The steps that turn the tool back in its grip, and the numbers, from 1, of those that may.
-
-    `uncertain` are the numbers of known ones where a step may not turn at all: it, or the one before.
-    """
+    """The steps that turn the tool back in its grip. Numbers of steps count from 1."""
 
     known: tuple[Reversal, ...]
+    # The numbers of further steps that may turn it back.
     possible: tuple[int, ...]
+    # The numbers of those in `known` where the step, or the earlier one, possibly does not turn at all.
     uncertain: frozenset[int]
 
 
@@ -262,10 +269,11 @@ def reversals(file: ExperimentFile, start: KnownTool = AT_REST) -> Reversals:
     known: list[Reversal] = []
     possible: list[int] = []
     uncertain: set[int] = set()
-    # The possible directions of the last turn, each with its latest step that turns for certain, else its latest step.
+    # The possible directions of the last turn, each with the number of its step. A step that turns for certain stays
+    # here when a later step may turn the same way.
     last: dict[Direction, int] = {}
     certain: set[int] = set()
-    # The last turn that loaded the tool further.
+    # The latest turn in the direction of the tool's load.
     loaded: _EarlierTurn | None = None
     for number, (step, turn) in enumerate(zip(file.steps, turns(file, start), strict=True), 1):
         if isinstance(step, ReleaseStep):

@@ -115,8 +115,8 @@ class RobotiqGripper:
     async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
         """Return the state of the active gripper; an inactive gripper opens and closes its fingers once.
 
-        Its fingers may hold an object, which drops then: an inactive gripper, or one that is too hot, is activated only
-        if an object `may_drop`. After a major fault the operator has to confirm that the fingers are clear.
+        An object in the fingers drops then. So an inactive gripper, or one that is too hot, is activated only if an
+        object `may_drop`. After a major fault the operator has to confirm that the fingers are clear.
         `operator_confirmed` activates in any state. Raises GripperFaultError if the activation is refused or fails:
         GripperInactiveError or GripperTooHotError if the object is the reason.
         """

@@ -84,7 +84,7 @@ class CommandHandler:
         self._executor.take(sample)
 
     def _shows_same_program(self, sample: RtdeSample) -> bool:
-        """Return whether a sample shows the program of the sample before: nothing can have replaced it in between.
+        """Return whether a sample certainly shows the same program as the sample before.
 
         A program that plays after a pause can be another one. So can any program after a time without samples, as
         during a slow request.

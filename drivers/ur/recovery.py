@@ -30,7 +30,7 @@ STARTS_WITHIN_S, UPLOAD_AGAIN_S = 6.0, 3.0
 # An arm that does not come to rest has no load that could be measured for longer than this.
 LOAD_WITHIN_S = 5.0
 
-# Messages at the pendant keep the program from starting.
+# Messages at the pendant prevent the program from starting.
 _CLOSE_POPUPS = ("close popup", "close safety popup")
 
 NOT_STARTING = (
@@ -172,8 +172,8 @@ class Recovery:
     def _ask_dashboard(self, sample: RtdeSample, now_ns: int, *requests: str, ours: bool) -> None:
         """Have the dashboard carry out requests, unless the program on the robot may be another client's.
 
-        That is asked right before each request: another program can begin at any time. A cycle asks the dashboard once,
-        because its answer may come after seconds.
+        Another program can begin at any time, so the controller is asked for other clients right before each request.
+        A cycle asks the dashboard once, because the answer may take seconds.
         """
         if self._left_alone_ns is not None:
             self._leave_alone(sample, now_ns)

@@ -278,7 +278,9 @@ class BesideAnother(RuleBasedStateMachine):
     @rule()
     def another_begins(self) -> None:
         if self.arm.reading.runtime_state == PLAYING:
-            self.program_ends()
+            self.arm.end_program()
+        # The next program takes several samples to begin: the end or the pause of the one before is seen.
+        self.bench.run(1)
         self.arm.begin_anothers()
         # No program plays and is paused within one cycle.
         self.bench.run(1)

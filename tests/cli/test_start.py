@@ -94,10 +94,15 @@ def test_init_writes_files_that_load_and_changes_none(tmp_path, ran, mistake):
 
 @pytest.fixture
 def untouched(tmp_path, ran, tiny_bank) -> Path:
-    """The configuration of a fresh folder of `init`, with its bank."""
+    """The configuration of a fresh folder of `init`, with its bank, at addresses that no other daemon has."""
     ran("init", tmp_path / "rig")
     shutil.copy(tiny_bank, tmp_path / "rig" / "paper.bank")
-    return tmp_path / "rig" / "rig.yaml"
+    path = tmp_path / "rig" / "rig.yaml"
+    text = path.read_text()
+    for key, port in (("publish", 7761), ("commands", 7762)):
+        text = text.replace(f"{key}: tcp://127.0.0.1:{port}", f"{key}: ipc://{tmp_path}/{key}")
+    path.write_text(text)
+    return path
 
 
 @pytest.mark.usefixtures("ur_rtde")

@@ -16,7 +16,7 @@ from shearloop.errors import UserError
 def held_from_daemons(commands: str, holder: str) -> Iterator[None]:
     """Keep the daemons of every user of this computer away from an address of `commands`, as a daemon does.
 
-    `holder` is the sentence for who asks there meanwhile. Raises UserError if a daemon, or another holder, has it, or
+    `holder` is the reply to each request there. Raises UserError if a daemon, or another holder, has it, or
     if it cannot be bound.
     """
     refuse_second_daemon(commands, cure="")
@@ -29,7 +29,7 @@ def held_from_daemons(commands: str, holder: str) -> Iterator[None]:
     except NameTakenError as error:
         raise UserError(
             f"the stop socket of `commands: {commands}` is taken: a daemon of this or another user has it and does not "
-            "answer; `sudo ss -xlp` says who: end it first"
+            "answer; `sudo ss -xlp` shows the process: end it first"
         ) from error
     with closing(held), closing(asyncio.new_event_loop()) as loop:
         serving = loop.create_task(held.run())

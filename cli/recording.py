@@ -179,7 +179,7 @@ def _summary_text(found: "RecordingSummary") -> str:
 
 
 def _other_keys(found: "RecordingSummary") -> list[str]:
-    """Return a line for each topic whose keys are not those of this version."""
+    """Return the lines on topics and keys that differ from this version's."""
     lines = []
     for name, topic in found.topics.items():
         if topic.not_recorded:

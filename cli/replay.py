@@ -122,7 +122,7 @@ def _publisher(context: "zmq.asyncio.Context", args: argparse.Namespace, clock: 
 
 
 def _other_keys_text(run: "RecordedRun", made_by: str) -> list[str]:
-    """Return what to print of a recording whose messages have other keys than this version's."""
+    """Return the lines on topics and keys of a recording that differ from this version's."""
 
     def named(topics: Mapping[str, Sequence[str]]) -> str:
         return "; ".join(f"{', '.join(keys)} of {topic}" for topic, keys in topics.items())

@@ -72,9 +72,10 @@ def figures_of(tracks: EstimateTrack | Sequence[EstimateTrack]) -> Figures:
     """
     tracks = _several(tracks)
     torque, diameter = (_compare(_known_frames(tracks, quantity), unit) for quantity, unit in UNITS.items())
+    judged = torque if torque["n"] else diameter
     latency = np.concatenate([track.latency_ms for track in tracks])
     figures = {name: value for name, value in torque.items() if name not in ("n", "gain")} | {
-        "valid_fraction": (torque if torque["n"] else diameter)["valid_fraction"],
+        "valid_fraction": judged["valid_fraction"],
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
         "frames": sum(len(track.estimates) for track in tracks),

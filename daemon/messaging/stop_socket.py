@@ -44,7 +44,7 @@ class StopSocket:
             if error.errno == errno.EADDRINUSE:
                 raise NameTakenError(
                     f"{cannot}; is another daemon running? Stop it, or choose another port; if another user holds its "
-                    "name, `sudo ss -xlp` says who"
+                    "name, `sudo ss -xlp` shows the process"
                 ) from error
             raise UserError(f"{cannot}; choose another address") from error
 

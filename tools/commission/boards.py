@@ -68,7 +68,7 @@ class Boards:
 
     @property
     def without_lag(self) -> list[str]:
-        """The names of those whose clock is judged: all but the load cell, whose filter delays it."""
+        """The names of the devices with a judged clock: all but the load cell, because its filter delays it."""
         return [*self.fingertips, *([SKIN] if self.skin is not None else [])]
 
     @property
@@ -178,7 +178,7 @@ def _clocks(context: Context, boards: Boards) -> list[Line]:
 
 
 def _press(context: Context, boards: Boards) -> list[Line]:
-    """Ask for one press on the tool, and return the lines on the moments at which the devices saw it."""
+    """Ask for one press on the tool, and return the lines on when the devices saw it."""
     config = context.config
     periods_s = [fingertip.frame_period_s for fingertip in config.fingertips.values()]
     if config.skin is not None:
@@ -221,7 +221,7 @@ def _press(context: Context, boards: Boards) -> list[Line]:
 
 
 def _strength(config: DaemonConfig) -> tuple[float, str]:
-    """Return the torque of the press in N·m, and in words what it may put on the skin."""
+    """Return the torque of the press in N·m, and in words the largest force on the skin."""
     if config.skin is None:
         return _PRESS_NM, ""
     largest_n = largest_shear_n(load_calibration(config.skin.calibration), config.skin.normal_n)

@@ -24,7 +24,7 @@ class TimeLimits:
     script_tolerance: float
     # The largest difference of a board's rate from the configured rate, as a fraction.
     rate_tolerance: float
-    # The largest difference between the moments at which two devices see the same event.
+    # The largest difference of two devices' times of the same event.
     clocks_s: float
     # How much later than the settings' times the computer may be. None: the limit is the promise of docs/safety.md.
     late_s: float | None = None
@@ -35,7 +35,7 @@ class TimeLimits:
 
     @property
     def rehearsed(self) -> bool:
-        """Whether the deadlines are so long that the arm ends its way before a layer stops it: no stop is measured."""
+        """Whether no stop is measured: the arm ends its way before the long deadlines stop it."""
         return self.late_s is not None
 
     def rest_s(self, settings: UrSettings) -> float:

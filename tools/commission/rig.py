@@ -48,7 +48,7 @@ class Rig(Protocol):
         """Return the arm's model and its rated payload."""
 
     def has_other_client(self, own: ScriptRegisters) -> bool:
-        """Return whether another client writes the registers beside ours."""
+        """Return whether another client writes registers too."""
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
         """Write a value into our register, and return what the controller reports of it."""
@@ -98,7 +98,7 @@ class ConnectedRig:
         return read_arm(settings.host, settings.connect_timeout_s, settings.facts.major)
 
     def has_other_client(self, own: ScriptRegisters) -> bool:
-        """Return whether another client writes the registers beside ours."""
+        """Return whether another client writes registers too."""
         return has_other_client(self._settings.host, self._settings.connect_timeout_s, own)
 
     def write_register(self, registers: ScriptRegisters, value: int) -> int:
@@ -157,7 +157,7 @@ class ConnectedRig:
 
 async def _readings(config: SkinConfig) -> AsyncGenerator[SkinSample]:
     """Yield the skin's readings, and watch its current source; switch it off at the end."""
-    # The report has what is lost, and the terminal the commissioning's own lines.
+    # No observer: the report names lost readings, and the terminal shows the commissioning's lines alone.
     skin = skin_device(config, load_calibration(config.calibration), averaged=1, observer_of=lambda _: None)
     watching = asyncio.create_task(skin.watch_source())
     try:

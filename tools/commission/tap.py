@@ -94,7 +94,7 @@ def judge_clocks(
     rate_hz: float,
     clocks_s: float = REAL.clocks_s,
 ) -> list[Line]:
-    """Return the lines on the moments at which the devices saw a press, against that of a reference device.
+    """Return the lines on when the devices saw a press, compared with a reference device.
 
     `boards` are those without a lag, by their names.
     """

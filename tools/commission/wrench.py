@@ -29,12 +29,12 @@ _READ_S: Final = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The mean wrench of an arm that stands, the standard deviations of its force and torque, and the mean's error."""
+    """The mean wrench of an arm that stands, the standard deviations of force and torque, and the mean's error."""
 
     mean: Six
     force_sigma_n: float
     torque_sigma_nm: float
-    torque_error_nm: float = 0.0
+    torque_error_nm: float
     """The standard error of the mean torque."""
 
     @classmethod

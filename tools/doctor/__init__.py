@@ -182,7 +182,7 @@ def check_disk(folder: Path) -> Finding:
 
 
 def check_recording(folder: Path) -> Finding:
-    """Check that the daemon can record in a folder, and the space for it."""
+    """Check that the daemon can record in a folder, and that its disk has space."""
     if reason := why_not_recorded(folder):
         return trouble("disk", reason.cause, "the daemon does not start", reason.cure)
     return check_disk(folder)

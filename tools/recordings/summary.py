@@ -22,7 +22,7 @@ MIN_RATED_MESSAGES, MIN_RATED_S = 3, 1.0
 
 @dataclass(slots=True)
 class TopicSummary:
-    """One topic; a few messages, or those of a short time, have no mean rate."""
+    """One topic. A few messages, or messages of a short time, have no mean rate."""
 
     messages: int = 0
     rate_hz: float | None = None

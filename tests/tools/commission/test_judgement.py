@@ -239,7 +239,7 @@ def test_stops_by_hand_come_once_at_each_speed_and_then_at_the_largest(passed, c
     assert hand_speeds(passed, count) == speeds
 
 
-READING = Reading(SIX, 0.5, 0.02)
+READING = Reading(SIX, 0.5, 0.02, 0.001)
 
 
 @pytest.mark.parametrize(

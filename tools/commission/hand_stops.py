@@ -26,10 +26,10 @@ _CONNECTED_WITHIN_S: Final = 20.0
 INTERRUPTED_NS: Final = 500_000_000
 # The wrist turned at the stop if it had half of its speed within this time before; at each end of its way it stands.
 _TURNED_WITHIN_NS: Final = 500_000_000
-# Speeds that count are rounded down to this many parts of 1 rad/s.
-_PARTS: Final = 100
-# Of a floating-point number of parts.
-_ROUNDING: Final = 1e-6
+# A stopped speed is rounded down to 0.01 rad/s.
+_STEPS_PER_RAD_PER_S: Final = 100
+# The error of the floating-point number of steps is smaller.
+_STEP_ERROR: Final = 1e-6
 # How often the operator is asked for a stop, if it is not seen.
 _TRIES: Final = 3
 
@@ -67,7 +67,7 @@ class HandStop:
         """
         if self.rad_per_s >= self.asked_rad_per_s - noise_rad_per_s:
             return self.asked_rad_per_s
-        return math.floor(_PARTS * self.rad_per_s + _ROUNDING) / _PARTS
+        return math.floor(_STEPS_PER_RAD_PER_S * self.rad_per_s + _STEP_ERROR) / _STEPS_PER_RAD_PER_S
 
 
 @dataclass(frozen=True, slots=True)

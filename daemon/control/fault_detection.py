@@ -184,18 +184,19 @@ def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | 
     if source.name in inputs.lost:
         gone = "not connected yet" if latest is None else "gone"
         return Fault(FaultCode.SENSOR_LOST, f"{source.name} is {gone}: {inputs.lost[source.name]}")
-    too_few = inputs.arm.no_torque if source.from_robot and inputs.arm is not None else ""
+    why_no_wrench = inputs.arm.no_torque if source.from_robot and inputs.arm is not None else ""
+    if latest is None and why_no_wrench:
+        return Fault(FaultCode.WRENCH_UNKNOWN, why_no_wrench)
     if latest is None:
-        silent = Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
-        return Fault(FaultCode.WRENCH_UNKNOWN, too_few) if too_few else silent
+        return Fault(FaultCode.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
     what = "torque" if source.measures_torque else "frame"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
     transport_s = measured_s - came_s - source.acquired_s
     if measured_s > source.oldest_s and transport_s > came_s:
         return Fault(FaultCode.ESTIMATE_LATE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
     is_old = came_s > source.fresh_s or measured_s > source.oldest_s
-    if is_old and too_few:
-        return Fault(FaultCode.WRENCH_UNKNOWN, too_few, t_ns=latest.t_ns)
+    if is_old and why_no_wrench:
+        return Fault(FaultCode.WRENCH_UNKNOWN, why_no_wrench, t_ns=latest.t_ns)
     if came_s > source.fresh_s:
         old = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, old, t_ns=latest.t_ns)

@@ -133,8 +133,8 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     if not all(map(math.isfinite, measured)):
         return "The controller reports values that are no numbers."
     limits = settings.limits
-    if (place := beyond_its_place(sample, limits)) is not None:
-        return place.sentence
+    if (outside := position_beyond_limits(sample, limits)) is not None:
+        return outside.sentence
     speeds = [
         (f"joint {number} speed" if number <= WRIST else "wrist speed", abs(qd), limits.wrist_speed_rad_per_s, "rad/s")
         for number, qd in enumerate(sample.qd_rad_per_s, 1)
@@ -147,7 +147,7 @@ def violation(sample: RtdeSample, settings: UrSettings) -> str:
     return found.sentence if found is not None else ""
 
 
-def beyond_its_place(sample: RtdeOutputs, limits: UrLimits) -> Hint | None:
+def position_beyond_limits(sample: RtdeOutputs, limits: UrLimits) -> Hint | None:
     """Return which joint is beyond its range, or that the tool is beyond the workspace, and the cure; or None."""
     joints, box = limits.joints, limits.box
     cure = "move the arm back with freedrive at the teach pendant, or correct `limits.{}` in the robot's settings"

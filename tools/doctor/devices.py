@@ -25,7 +25,7 @@ from shearloop.drivers.robotiq.messages import ActivationStatus, fault_of
 from shearloop.drivers.shear_skin.instruments import PolledInstrument
 from shearloop.drivers.ur.control_box import ControllerInfo, check_generation, check_ports, query_controller, untested
 from shearloop.drivers.ur.dashboard import REMOTE_CURE
-from shearloop.drivers.ur.limits import beyond_its_place, slowed_by, tool_difference
+from shearloop.drivers.ur.limits import position_beyond_limits, slowed_by, tool_difference
 from shearloop.drivers.ur.messages import RobotLostError, RtdeOutputs
 from shearloop.drivers.ur.ports import FIELDBUS_MENU
 from shearloop.drivers.ur.primary_port import PrimaryPort
@@ -193,7 +193,7 @@ def _check_setting(settings: UrSettings, seen: ControllerInfo) -> Iterator[Findi
 
 def check_place(outputs: RtdeOutputs, limits: UrLimits) -> Finding:
     """Judge whether the arm stands within the workspace and the ranges of its joints."""
-    subject, place = "place of the arm", beyond_its_place(outputs, limits)
+    subject, place = "place of the arm", position_beyond_limits(outputs, limits)
     if place is None:
         return good(subject, "inside the workspace and the joints' ranges")
     return trouble(subject, place.cause, "the daemon refuses every motion", place.cure)

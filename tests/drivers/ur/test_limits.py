@@ -211,7 +211,7 @@ def test_values_that_are_no_numbers_stop():
 @pytest.mark.parametrize(
     ("changes", "limit"), [({"tcp_pose": six(0, 9.0)}, "workspace"), ({"q_rad": six(2, -9.0)}, "joints")]
 )
-def test_an_arm_outside_its_place_is_moved_back_by_hand_or_its_limits_are_corrected(changes, limit):
+def test_an_arm_outside_its_limits_is_moved_back_by_hand_or_its_limits_are_corrected(changes, limit):
     found = violation(dataclasses.replace(AT_REST, **changes), SETTINGS)
     assert f"move the arm back with freedrive at the teach pendant, or correct `limits.{limit}`" in found
 

@@ -44,6 +44,9 @@ def run(args: argparse.Namespace) -> int:
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
     # A rehearsal runs all the same, so the other parts are judged and shown as well.
     for_real = "\n".join(parts.mistakes.pop(part) for part in OF_REAL_DEVICES if part in parts.mistakes)
+    if for_real and REHEARSAL in parts.texts:
+        # Then nothing can run it.
+        parts.mistakes[REHEARSAL] = f"a rehearsal is {parts.texts[REHEARSAL]}"
     if parts.mistakes:
         if is_experiment and plan_lines and not args.json:
             # A rehearsal shows where in the plan the refused steps are.
@@ -58,8 +61,6 @@ def run(args: argparse.Namespace) -> int:
     if for_real:
         rehearsal = "a rehearsal (`shearloop run --emulate`)" if args.rig is None else f"a rehearsal of {args.rig}"
         verdict = f"{for_real}\n{verdict} for {rehearsal}; the real devices need the changes above"
-        if REHEARSAL in parts.texts:
-            verdict = f"{for_real}\n{args.config} needs the changes above, and cannot be rehearsed"
     return print_result(result, [*sentences, verdict], as_json=args.json)
 
 

@@ -51,9 +51,10 @@ def check_example_addresses(config: DaemonConfig) -> Iterator[Finding]:
 def _addresses(config: DaemonConfig) -> dict[str, str]:
     """Return the address of each device by its key, also the robot's, if its settings can be read."""
     found = config.device_addresses
-    # The mistakes in the settings are among the findings on files.
-    with contextlib.suppress(DriverError):
-        found |= {"robot": read_settings(config.robot).host} if config.robot is not None else {}
+    if config.robot is not None:
+        # The mistakes in the settings are among the findings on files.
+        with contextlib.suppress(DriverError):
+            found["robot"] = read_settings(config.robot).host
     return found
 
 

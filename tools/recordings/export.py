@@ -16,7 +16,7 @@ from shearloop.files import replace_file
 from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import columns_of_topics, read_messages
-from shearloop.tools.recordings.recorded_columns import TopicColumns
+from shearloop.tools.recordings.recorded_columns import UNITS_TABLE, TopicColumns
 from shearloop.tools.recordings.tables import Rows, arrays, columns_of, read_rows, row_of
 
 # Numbers of a Parquet table that are written at once.
@@ -27,7 +27,6 @@ _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 # MATLAB takes 63 characters.
 _LONGEST_NAME = 59
 # The variable of a MATLAB file, and the table next to the CSV files, with the units of all columns.
-_UNITS = "units"
 # A cell with one of these stands in quotes.
 _QUOTED = re.compile(r'[",\r\n]')
 
@@ -71,7 +70,7 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
             used = {name: topic for topic, name in names.items() if waiting[topic]}
             structs: dict[str, Mapping[str, Any]] = {name: arrays(waiting[topic]) for name, topic in used.items()}
             if used:
-                structs[_UNITS] = {name: columns[topic].units for name, topic in used.items()}
+                structs[UNITS_TABLE] = {name: columns[topic].units for name, topic in used.items()}
             target = part(len(written) + 1)
             if written:
                 check_new(target)
@@ -110,7 +109,7 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     if form == "parquet":
         require("pyarrow", "export", "Parquet")
     paths = {topic: out / f"{topic}.{form}" for topic in topics}
-    units = {_UNITS: out / f"{_UNITS}.csv"} if form == "csv" else {}
+    units = {UNITS_TABLE: out / f"{UNITS_TABLE}.csv"} if form == "csv" else {}
     for target in (paths | units).values():
         check_link("--out", target)
         check_apart("--out", target, [(f"the recording {path}", path)])
@@ -132,7 +131,9 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
         if form == "csv":
             rows = [(topic, *unit) for topic in tables for unit in columns[topic].units.items()]
             lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
-            files.enter_context(replace_file(units[_UNITS])).write("".join(f"{line}\r\n" for line in lines).encode())
+            files.enter_context(replace_file(units[UNITS_TABLE])).write(
+                "".join(f"{line}\r\n" for line in lines).encode()
+            )
     return list((paths | units).values())
 
 

@@ -28,8 +28,8 @@ _MOST_KEYS = 1000
 _KEY = re.compile(r"[a-z][a-z0-9_]{0,58}", re.ASCII)
 # Topics that this version does not have become names of files and of MATLAB's variables.
 _TOPIC = re.compile(r"[a-z][a-z0-9_]{0,30}(\.[A-Za-z0-9_-]{1,60}){0,3}", re.ASCII)
-# An export has a table of this name.
-_UNITS_TABLE = "units"
+# The table of an export's units, which no topic is named like.
+UNITS_TABLE = "units"
 _LOG_TIME = "log_time_ns"
 _LONGEST_UNIT = 20
 # Earlier versions wrote the unit only at the end of the description.
@@ -154,7 +154,7 @@ def recorded_topic(topic: str, written: Schema | None) -> TopicColumns:
     Raises SchemaError for a schema that no version writes, and for a topic that only a schema would describe.
     """
     name = own_name(topic)
-    if name is None and (not _TOPIC.fullmatch(topic) or topic == _UNITS_TABLE):
+    if name is None and (not _TOPIC.fullmatch(topic) or topic == UNITS_TABLE):
         raise SchemaError(f"no version has a topic {topic[:40]!r}")
     if written is None:
         if name is None:

@@ -126,8 +126,7 @@ class ExperimentFiles:
     """The experiments that a request may name: regular files of at most 32 kB in `folders`, or below them.
 
     Each can run on the rig of `config`, with its torque `sources`, but the robot's, and its `robot`, if that is known.
-    None begins, and none is listed anew, where a file of `loaded` has changed: the check of experiments is loaded with
-    the first one.
+    None begins, and no file is read for the list, where a file of `loaded` has changed.
     """
 
     folders: tuple[Path, ...]
@@ -164,7 +163,7 @@ class ExperimentFiles:
         """Read the files that have changed and renew the list; return None, or why no file is read now."""
         if (reason := reading_refusal()) is not None:
             return reason
-        # The list loads the check too.
+        # The first file that is read loads the check of experiments.
         if outdated := await self._in_thread(self.loaded.why_outdated):
             return outdated
         stamps = await self._in_thread(self._stamps)

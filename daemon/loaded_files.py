@@ -69,8 +69,10 @@ class LoadedFiles:
         Of a rehearsal these are the files of the real configuration, which a person changes.
         """
         real = config.real
-        named = [path for key, path in real.walk() if isinstance(path, Path) and key != "experiment"]
-        return cls([*named, *((real.file,) if real.file is not None else ()), *code_of(package)])
+        files = [path for key, path in real.walk() if isinstance(path, Path) and key != "experiment"]
+        if real.file is not None:
+            files.append(real.file)
+        return cls([*files, *code_of(package)])
 
     def why_outdated(self) -> str:
         """Return which file has changed since the daemon's start; empty if none has. It reads the files that may have.

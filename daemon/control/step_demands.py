@@ -244,7 +244,9 @@ def _moves(step: HoldTorqueStep | TurnToStep | TwistStep, start: float, speeds: 
         case TurnToStep(angle_rad=angle_rad):
             angles_rad = [start, angle_rad]
         case TwistStep(return_to_start=True, repeats=repeats):
-            angles_rad = [start, *(turned_to for angle_rad in step.angles_rad for turned_to in (angle_rad, start))]
+            angles_rad = [start]
+            for angle_rad in step.angles_rad:
+                angles_rad += [angle_rad, start]
         case TwistStep(repeats=repeats):
             angles_rad = [start, *step.angles_rad]
     turns_rad = _turns(angles_rad)

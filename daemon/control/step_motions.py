@@ -69,7 +69,4 @@ def first_release(file: ExperimentFile) -> int | None:
     Only a `release` lets a tool drop. The gripper's task refuses a `grip` that would open the fingers on a tool, or
     activate the gripper.
     """
-    for number, step in enumerate(file.steps, 1):
-        if isinstance(step, ReleaseStep):
-            return number
-    return None
+    return next((number for number, step in enumerate(file.steps, 1) if isinstance(step, ReleaseStep)), None)

@@ -64,12 +64,12 @@ def run(args: argparse.Namespace) -> int:
     return print_result(result, [*sentences, verdict], as_json=args.json)
 
 
-def _note_reach(config: "DaemonConfig", parts: "Parts") -> None:
-    """Add why a rehearsal is refused, if its emulated arm does not reach the workspace. The real arm may be larger."""
-    from shearloop.cli.rehearsal import refuse_workspace_out_of_reach
+def _note_rehearsal(config: "DaemonConfig", path: Path, parts: "Parts") -> None:
+    """Add why a rehearsal is refused, if it is. The real devices may run all the same."""
+    from shearloop.cli.rehearsal import refuse_what_cannot_be_emulated
 
     try:
-        refuse_workspace_out_of_reach(config)
+        refuse_what_cannot_be_emulated(config, path)
     except UserError as error:
         parts.texts[REHEARSAL] = f"refused: {error}"
 
@@ -99,7 +99,7 @@ def _check_configuration(path: Path) -> "Parts":
     with parts.of("configuration"):
         config = load_daemon_config(path)
         parts = check_parts(config, path, check_emulators)
-        _note_reach(config, parts)
+        _note_rehearsal(config, path, parts)
     if "configuration" in parts.mistakes:
         with parts.of("experiment"):
             _check_named_experiment(path)
@@ -118,7 +118,7 @@ def _check_experiment(path: Path, rig: Path | None) -> "Parts":
     if config.robot is None:
         raise UserError(f"{rig}: an experiment needs a robot: add `robot: ur.yaml`")
     parts = check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
-    _note_reach(config, parts)
+    _note_rehearsal(config, rig, parts)
     return parts
 
 

@@ -45,12 +45,16 @@ def rehearsal(config: "DaemonConfig", path: Path) -> Iterator[Rehearsal]:
         yield _DeviceReplacer(config, path, folder).rehearsal()
 
 
-def refuse_workspace_out_of_reach(config: "DaemonConfig") -> None:
-    """Raise UserError if the emulated arm cannot stand in the workspace of a configured robot with valid settings."""
+def refuse_what_cannot_be_emulated(config: "DaemonConfig", path: Path) -> None:
+    """Raise UserError for a real rig that has a fingertip without a bank, or a workspace beyond the emulated arm."""
     from shearloop.drivers.errors import DriverError
     from shearloop.drivers.ur.settings import read_settings
 
-    if config.robot is None or config.emulated:
+    if config.emulated:
+        return
+    for name, fingertip in config.fingertips.items():
+        _bank(name, fingertip, path)
+    if config.robot is None:
         return
     # The check of the robot's settings reports their mistakes.
     with contextlib.suppress(DriverError):

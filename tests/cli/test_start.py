@@ -222,6 +222,20 @@ def test_a_workspace_that_the_emulated_arm_does_not_reach_is_named_in_words(tool
 
 
 @pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize(("robot", "status"), [({}, 0), ({"robot": "ur.yaml"}, 2)])
+def test_a_fingertip_without_a_bank_is_named_because_no_rehearsal_plays_it(robot, status, untouched, ran):
+    fit("motion_regression", [twisting(tips=(1,), peak_nm=0.25)], "rig").save(untouched.with_name("right.cal"))
+    fingertip = {"device": {"serial_number": "7"}, "calibration": "right.cal"}
+    addresses = {key: f"ipc://{untouched.parent}/{key}" for key in ("publish", "commands")}
+    untouched.write_text(yaml.safe_dump({"fingertips": {"right": fingertip}, **addresses, **robot}))
+    why = f"{untouched}: `fingertips.right` has no `bank`, whose signals make the emulated frames; give one"
+    out, err = ran("check", untouched, status=status)
+    assert f"refused: {why}" in (err if status else out)
+    assert "in order for a rehearsal" not in out
+    assert why in ran("run", untouched, "--emulate", status=2).err
+
+
+@pytest.mark.usefixtures("ur_rtde")
 def test_an_untouched_folder_is_rehearsed_and_the_first_lines_say_what_is_not_filled_in(untouched):
     with rehearsal(load_daemon_config(untouched), untouched) as rehearsed:
         settings = open_settings(rehearsed.config)

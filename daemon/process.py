@@ -10,7 +10,6 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import NoReturn
 
 from shearloop.errors import UserError
 
@@ -31,19 +30,18 @@ def ending_signals() -> tuple[signal.Signals, ...]:
     return (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hangs_up else ()))
 
 
-class TerminationInterrupt(KeyboardInterrupt):
-    """SIGTERM or SIGHUP, its argument, raised like Ctrl-C so that the same clean-up runs."""
-
-
 @contextlib.contextmanager
 def raise_ending_signals() -> Iterator[None]:
-    """Raise KeyboardInterrupt for every ending signal, in the main thread.
+    """Raise KeyboardInterrupt for every ending signal, in the main thread, with the signal's number.
 
-    Python drops an exception that is raised in a callback from compiled code; the signal is then sent again.
+    SIGTERM and SIGHUP are handled as SIGINT is, so that the same clean-up runs: asyncio cancels its main task, since an
+    exception amid its own work can lose a task or a connection. Python drops an exception that is raised in a callback
+    from compiled code; the signal is then sent again.
     """
     if not ending_signals():
         yield
         return
+    ended_by: list[int] = []
     retries: list[threading.Timer] = []
     previous_hook = sys.unraisablehook
 
@@ -52,13 +50,24 @@ def raise_ending_signals() -> Iterator[None]:
             previous_hook(dropped)
             return
         # Later: raised in this hook, it would be dropped again.
-        retries.append(threading.Timer(RETRY_S, os.kill, (os.getpid(), _number(dropped.exc_value))))
+        retries.append(threading.Timer(RETRY_S, os.kill, (os.getpid(), number_of(dropped.exc_value))))
         retries[-1].start()
 
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        ended_by.append(number)
+        handler = signal.getsignal(signal.SIGINT)
+        if handler is signal.default_int_handler or not callable(handler):
+            raise KeyboardInterrupt(number)
+        handler(number, frame)
+
     sys.unraisablehook = hook
-    handlers = {number: signal.signal(number, _raise) for number in ending_signals() if number != signal.SIGINT}
+    handlers = {number: signal.signal(number, interrupt) for number in ending_signals() if number != signal.SIGINT}
     try:
         yield
+    except KeyboardInterrupt as interruption:
+        # asyncio raises it without a number.
+        interruption.args = interruption.args or tuple(ended_by[:1])
+        raise
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
@@ -68,17 +77,9 @@ def raise_ending_signals() -> Iterator[None]:
             timer.join()
 
 
-def interrupt_status(interrupt: KeyboardInterrupt) -> int:
-    """Return the exit status that shells use: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
-    return 128 + _number(interrupt)
-
-
-def _raise(number: int, _: FrameType | None) -> NoReturn:
-    raise TerminationInterrupt(number)
-
-
-def _number(interrupt: BaseException | None) -> int:
-    return int(interrupt.args[0]) if isinstance(interrupt, TerminationInterrupt) else signal.SIGINT
+def number_of(interrupt: BaseException | None) -> int:
+    """Return the number of the signal behind an interrupt, Ctrl-C's where it has none."""
+    return int(interrupt.args[0]) if interrupt is not None and interrupt.args else signal.SIGINT
 
 
 def raise_priority() -> None:

@@ -213,7 +213,7 @@ class FrameParser(Parser[Frame]):
         """
         after_ns, period_ns = sent_ns - self._sent_ns, self.clock.period_ns
         # The configured period may be another board's.
-        is_timed = self.clock.learned and period_ns >= FASTEST_NS
+        is_timed = self.clock.learned_from > 0 and period_ns >= FASTEST_NS
         together = is_timed and after_ns < TOGETHER * period_ns
         self._sent_ns = sent_ns
         self._earliest_ns = self._earliest_ns + period_ns if together else sent_ns - LATE_NS
@@ -303,7 +303,7 @@ class EitKit(SerialSensor[Frame]):
             "frames": parser.frames,
             "errors": {kind.name.lower(): count for kind, count in parser.errors.items()},
             "expected_hz": 1.0 / self._period_s,
-            "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
+            "measured_hz": 1.0 / self.period_s if parser.clock.learned_from else None,
         }
 
     @property

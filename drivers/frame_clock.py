@@ -35,7 +35,7 @@ class FrameClock:
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
     phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    `learned`.
+    learned.
 
     A frame is late, or the board paused before it and has a new phase. A pause of more than `longest_gap` periods shows
     at once. One of more than LATE_NS shows by two frames that are later than that. A shorter one shows by EQUALLY_LATE
@@ -44,9 +44,9 @@ class FrameClock:
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
         self._longest_gap = longest_gap
-        # The learned period, or the nominal one until it is learned.
+        # The period, and how many frames it is learned from: 0 for the nominal one.
         self.period_ns = nominal_period_ns
-        self.learned = False
+        self.learned_from = 0
         self._exact_period_ns = float(nominal_period_ns)
         # The number of the last frame, and how many frames up to it waited for their reader.
         self._number = self._waited_in_a_row = 0
@@ -103,7 +103,7 @@ class FrameClock:
 
     def _steps_to(self, arrival_ns: int, rejected: int | None, *, waited: bool) -> int:
         """Return how many periods after the last frame the next one was sent."""
-        if not self._seen or not self.learned or rejected == 0:
+        if not self._seen or not self.learned_from or rejected == 0:
             return 1
         steps = max(1, round(self._periods_to(arrival_ns)))
         # For a frame that waited, the time is only an upper bound.
@@ -144,11 +144,12 @@ class FrameClock:
         # A late frame makes spacings wrong, too.
         plausible_ns = max(PLAUSIBLE * spacing, LATE_NS / SPACING_FRAMES)
         if steady and abs(self._exact_period_ns - spacing) > plausible_ns:
-            self._exact_period_ns, self.learned = spacing, True
-        if len(self._seen) >= LEARN_FROM:
+            self._exact_period_ns, self.learned_from = spacing, LEARN_FROM
+        # Late frames make the slope of a few wrong, as after a restart: it is no better than that of more before it.
+        if len(self._seen) >= max(LEARN_FROM, self.learned_from):
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
-                self._exact_period_ns, self.learned = slope, True
+                self._exact_period_ns, self.learned_from = slope, len(self._seen)
         self.period_ns = round(self._exact_period_ns)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import sys
 from collections.abc import AsyncIterator
 
 from shearloop.drivers.errors import DriverError
@@ -14,6 +15,17 @@ async def halted_if_interrupted(gripper: RobotiqGripper) -> AsyncIterator[None]:
     try:
         yield
     except (asyncio.CancelledError, KeyboardInterrupt):
-        with contextlib.suppress(DriverError):
-            await gripper.halt()
+        try:
+            await _halt(gripper)
+        except DriverError as error:
+            print(f"The fingers may still move: they could not be halted. {error}", file=sys.stderr, flush=True)
         raise
+
+
+async def _halt(gripper: RobotiqGripper) -> None:
+    try:
+        await gripper.halt()
+    except DriverError:
+        # The connection is lost, perhaps by the interrupt.
+        await gripper.connect()
+        await gripper.halt()

@@ -1,5 +1,6 @@
 """The process: which signals end it in order, what the garbage collector looks through, its priority."""
 
+import asyncio
 import gc
 import os
 import signal
@@ -14,7 +15,14 @@ import pytest
 
 from shearloop.cli import emulator_processes, main
 from shearloop.daemon import app, process
-from shearloop.daemon.process import NICENESS, ending_signals, raise_priority, without_long_collections
+from shearloop.daemon.process import (
+    NICENESS,
+    ending_signals,
+    number_of,
+    raise_ending_signals,
+    raise_priority,
+    without_long_collections,
+)
 from tests.fixtures.daemons import DEADLINE_S
 
 
@@ -44,6 +52,27 @@ def test_a_second_signal_does_not_kill_the_daemon(number, config, monkeypatch):
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize("number", ending_signals())
+def test_under_asyncio_each_ending_signal_cancels_the_main_task(number):
+    """Raised amid the loop's own work, an exception would lose what the task waits for."""
+    seen = []
+
+    async def interrupted() -> None:
+        try:
+            signal.raise_signal(number)
+            seen.append("goes on to its next wait")
+            await asyncio.sleep(DEADLINE_S)
+        except asyncio.CancelledError:
+            seen.append("cancelled")
+            raise
+
+    with pytest.raises(KeyboardInterrupt) as caught, raise_ending_signals():
+        asyncio.run(interrupted())
+    assert seen == ["goes on to its next wait", "cancelled"]
+    assert number_of(caught.value) == number
 
 
 def test_commands_run_in_any_thread_without_signal_handlers(config, tmp_path, monkeypatch):

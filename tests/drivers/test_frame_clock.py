@@ -25,7 +25,7 @@ def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns):
     late = np.random.default_rng(0).exponential(0.03 * period_ns, 400).astype(np.int64)
     clock = FrameClock(PERIOD_NS)
     error = straightened(truth + late, clock) - truth
-    assert clock.learned
+    assert clock.learned_from
     assert clock.period_ns == pytest.approx(period_ns, rel=1e-3)
     settled = error[40:]
     assert settled.std() < 0.25 * late[40:].std()
@@ -150,7 +150,7 @@ def test_the_period_is_learned_although_every_fourth_frame_waits():
         clock.arrived(t_ns + 250_000_000, 0, t_ns) - t_ns if n % 4 == 3 else clock.arrived(t_ns) - t_ns
         for n, t_ns in enumerate(truth)
     ]
-    assert clock.learned
+    assert clock.learned_from
     assert max(map(abs, errors_ns[80:])) < 1_000_000
 
 

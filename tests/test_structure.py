@@ -13,7 +13,7 @@ import grimp
 FOLDERS = ("bank", "estimation", "drivers", "emulators", "daemon", "tools", "studies", "cli")
 LONGEST_FUNCTION = 60
 # Objects of libraries are set up by assignment.
-OF_LIBRARIES = ("parser", "action", "config", "tqdm", "sys")
+OF_LIBRARIES = ("parser", "action", "config", "interruption", "tqdm", "sys")
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 

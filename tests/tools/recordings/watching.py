@@ -148,12 +148,13 @@ async def watching(folder: Path) -> AsyncIterator[Watched]:
     addresses = ("--connect", f"ipc://{folder}/publish")
     viewing = ("--commands", f"ipc://{folder}/commands", "--port", "0", "--token-file", str(folder / "token"))
     async with AsyncExitStack() as opened:
-        group = await opened.enter_async_context(asyncio.TaskGroup())
         listen = await opened.enter_async_context(shearloop("listen", "--json", *addresses))
         view = await opened.enter_async_context(shearloop("view", "--json", *addresses, *viewing))
         url = json.loads(await view.stdout.readline())["url"]
         http = await opened.enter_async_context(aiohttp.ClientSession())
         first = await opened.enter_async_context(http.ws_connect(f"{url}stream", max_msg_size=0))
+        # Its readers end before what they read from is closed.
+        group = await opened.enter_async_context(asyncio.TaskGroup())
         watched = Watched(url, http, group)
         group.create_task(_read_lines(listen, watched.listened))
         group.create_task(_read_batches(first, watched.paged, []))

@@ -24,7 +24,7 @@ from shearloop.cli.options import (
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
-from shearloop.tools.outputs import check_overwrite, progress_bar, writing
+from shearloop.tools.outputs import check_new, check_overwrite, progress_bar, writing
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
 
@@ -172,6 +172,9 @@ def _summary_text(found: "RecordingSummary") -> str:
         )
     if found.lost:
         lines.append(f"  Lost with them: {_lost_text(found.lost)}.")
+    if found.repaired_from is not None:
+        lost = _lost_text(found.lost_in_repair) or "nothing that its source showed"
+        lines.append(f"  It is the repaired copy of {found.repaired_from}; lost there: {lost}.")
     if found.dropped:
         dropped = counted(found.dropped, "message was", "messages were")
         lines.append(f"  {dropped} dropped because the disk was too slow.")
@@ -280,11 +283,9 @@ def _others(written: Sequence[Path]) -> list[Path]:
 
 
 def _import(args: argparse.Namespace) -> int:
-    from mcap.writer import MCAP0_MAGIC
-
     from shearloop.tools.recordings.matlab_import import import_mat
 
-    check_overwrite(args.out, "a recording", MCAP0_MAGIC)
+    check_new(args.out)
     imported = import_mat(args.sources, args.out, args.time_format)
     counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
     sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."

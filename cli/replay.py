@@ -71,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
             "not_recorded": run.not_recorded,
             "differing": run.differing,
             "left_out": run.left_out,
+            "lost_in_repair": run.lost,
             "left_out_topics": run.unknown_topics,
         }
         print_result(counts | others, (), as_json=True)
@@ -137,6 +138,9 @@ def _other_keys_text(run: "RecordedRun", made_by: str) -> list[str]:
     if run.unknown_topics:
         topics = ", ".join(run.unknown_topics)
         lines.append(f"{other} with the topics {topics}: this version does not have them, and leaves them out.")
+    if run.lost:
+        lost = ", ".join(f"{count} of {topic}" for topic, count in run.lost.items())
+        lines.append(f"The recording is a repaired copy, and {lost} are lost: what follows from them is different.")
     return lines
 
 

@@ -87,6 +87,13 @@ def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | No
         raise UserError(f"{out} exists and is not {kind}: it was not changed; choose another --out")
 
 
+def check_new(out: Path) -> None:
+    """Raise UserError if `out` exists, or is a link to nothing: for a file that cannot be made again."""
+    check_link("--out", out)
+    if out.exists():
+        raise UserError(f"{out} exists already; move it away, or name another file with --out")
+
+
 def _is_of_kind(head: bytes, begins: bytes | re.Pattern[bytes] | None) -> bool:
     if isinstance(begins, bytes):
         return head.startswith(begins)

@@ -112,7 +112,7 @@ def daemon_identity(config: DaemonConfig, fingertips: Mapping[str, Session]) -> 
         if isinstance(path, Path) and key.rpartition(".")[2] in _ATTACHED:
             for file in AttachedFile.read(path):
                 attached[file.name] = file
-                metadata[f"sha256 {path}"] = hashlib.sha256(file.data).hexdigest()
+                metadata[f"{schema.FILE_HASH} {path}"] = hashlib.sha256(file.data).hexdigest()
     return Identity(metadata, tuple(attached.values()))
 
 

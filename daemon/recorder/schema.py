@@ -40,6 +40,8 @@ CLOCK_TOPIC = f"{INPUT}.clock"
 METADATA = "shearloop"
 # Its key for the offset: all Unix times of a daemon's recording minus CLOCK_MONOTONIC, in ns.
 CLOCK_OFFSET = "clock_offset_ns"
+# The first word of its keys for attached files; their paths follow.
+FILE_HASH = "sha256"
 # Its key in a recording of an emulated rig; other recordings do not have it.
 EMULATED = "emulated"
 # One metadata record for each experiment, and one at the end of a closed recording.

@@ -40,17 +40,24 @@ def matlab() -> bytes:
         ("bank build --config {bank} --out", "a bank"),
         ("bank solve --mesh no --model step --k 1 --sigma 1 --out", "an array of NumPy"),
         ("bank design no.mcap --out", "a configuration"),
-        ("recording import mat no.mat --out", "a recording"),
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
 def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, mistake):
     there = tmp_path / "precious"
-    content = matlab() if kind == "a recording" else MCAP
-    there.write_bytes(content)
+    there.write_bytes(MCAP)
     bank = Path(__file__).parents[2] / "config" / "banks" / "demo.yaml"
     assert f"{there} exists and is not {kind}: it was not changed" in mistake(*command.format(bank=bank).split(), there)
-    assert there.read_bytes() == content
+    assert there.read_bytes() == MCAP
+
+
+@pytest.mark.parametrize("command", ["recording import mat no.mat", "recording repair no.mcap"])
+def test_no_command_overwrites_a_recording(command, tmp_path, mistake):
+    """It cannot be made again."""
+    there = tmp_path / "precious.mcap"
+    there.write_bytes(MCAP)
+    assert f"{there} exists already" in mistake(*command.split(), "--out", there)
+    assert there.read_bytes() == MCAP
 
 
 @pytest.mark.parametrize("content", [MCAP, b"PK\x03\x04\x14\0", matlab(), b"\x8eSHLBANK", "σ".encode()[:1] + b"x"])

@@ -115,7 +115,7 @@ class IntactRecords:
         self._progress = progress
         self.channels: dict[int, Channel] = {}
         self.schemas: dict[int, Schema] = {}
-        self.closed = self._indexed = False
+        self.closed = self.is_indexed = False
         self.size = self.damaged_chunks = self.damaged_attachments = self._intact_bytes = 0
         self._counts = _MessageCounts()
 
@@ -135,7 +135,7 @@ class IntactRecords:
     def is_damaged(self) -> bool:
         """Whether a part of the file, or its index, is missing or damaged."""
         damaged = self.damaged_chunks or self.damaged_attachments or self.lost
-        return bool(damaged) or not self.closed or not self._indexed
+        return bool(damaged) or not self.closed or not self.is_indexed
 
     @property
     def lost(self) -> dict[str, int]:
@@ -195,7 +195,7 @@ class IntactRecords:
         if summary is None:
             return []
         index, begins = summary
-        self._indexed = True
+        self.is_indexed = True
         self.channels.update(index.channels)
         self.schemas.update(index.schemas)
         if index.statistics is not None:

@@ -3,6 +3,9 @@
 The index is written when a file is closed, so a kill or a power loss leaves a file without it.
 """
 
+import json
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +16,12 @@ from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL, new_writer
 from shearloop.errors import UserError
 from shearloop.files import replace_file
-from shearloop.tools.outputs import check_link
+from shearloop.tools.outputs import check_new
 from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import NOTHING_INTACT, IntactRecords, Progress
+
+# The metadata record of a copy that is repaired: its source, and the numbers of lost messages by topic, as JSON.
+REPAIRED_METADATA = "shearloop.repaired"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +56,12 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     if out is None:
         name = source.name.removesuffix(PARTIAL)
         out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
-    check_link("--out", out)
-    if out.exists():
-        raise UserError(f"{out} exists already; move it away, or name another file with --out")
+    check_new(out)
     records = IntactRecords(source, progress)
     schemas: dict[str, int] = {}
     channels: dict[int, int] = {}
     identity: dict[str, str] = {}
+    lost: Counter[str] = Counter()
     messages = 0
     try:
         with replace_file(out) as file:
@@ -71,6 +76,8 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                         copied = channels[channel.id], record.log_time, record.data, record.publish_time
                         writer.add_message(*copied, record.sequence)
                         messages += 1
+                    case Metadata(name=name) if name == REPAIRED_METADATA:
+                        lost.update(lost_in_repair(record.metadata))
                     case Metadata(name=schema.METADATA):
                         identity = record.metadata
                     case Metadata():
@@ -83,6 +90,10 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
             identity = records.identity or identity
             if identity:
                 writer.add_metadata(schema.METADATA, identity)
+            # Without an index the numbers of the messages are all that shows a loss, and show an earlier one again.
+            lost = lost + Counter(records.lost) if records.is_indexed else lost | Counter(records.lost)
+            if records.is_damaged or lost:
+                writer.add_metadata(REPAIRED_METADATA, {"source": str(source), "lost": json.dumps(lost)})
             writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             if not messages:
                 raise UserError(f"{source}: {NOTHING_INTACT}")
@@ -98,6 +109,15 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         being_written,
         records.is_damaged,
     )
+
+
+def lost_in_repair(metadata: Mapping[str, str]) -> dict[str, int]:
+    """Return the numbers of lost messages by topic that the metadata of a repaired copy name, if it is one."""
+    try:
+        return {topic: int(count) for topic, count in json.loads(metadata.get("lost", "{}")).items()}
+    except (ValueError, TypeError, AttributeError):
+        # Another program has changed them.
+        return {}
 
 
 def _registered(writer: Writer, channel: Channel, records: IntactRecords, schemas: dict[str, int]) -> int:

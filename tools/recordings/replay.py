@@ -5,6 +5,7 @@ estimates bit for bit.
 """
 
 import asyncio
+import hashlib
 import json
 import math
 import tempfile
@@ -47,6 +48,7 @@ from shearloop.models import validated
 from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.reader import OpenRecording, open_recording, reading
 from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, own_name
+from shearloop.tools.recordings.repair import REPAIRED_METADATA, lost_in_repair
 from shearloop.tools.recordings.replayed_skin import ReplayedSkin
 
 # Topics that a replay computes. All others are sent as they were recorded.
@@ -55,6 +57,8 @@ COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
+# What tells the messages of a source apart, the first that they have; other code may move a time by less than this.
+_PLACES = (("frame", 0), ("sample", 0), ("t_mono_ns", 5_000_000))
 # The keys that a replay needs of each raw input and of each message, and the further ones by topic.
 _INPUT_KEYS, _CLOCK_KEYS = ("t_mono_ns", "kind", "data"), ("t_mono_ns", "offset_ns")
 _MESSAGE_KEYS: Mapping[str, tuple[str, ...]] = {
@@ -138,6 +142,8 @@ class RecordedRun:
             self.metadata = recording.identity
             self._attached = recording.attachments()
             continued = recording.metadata.get(schema.CONTINUED_METADATA, {})
+            # By topic: what a repaired copy does not have.
+            self.lost = lost_in_repair(recording.metadata.get(REPAIRED_METADATA, {}))
             # By topic.
             self._columns = {
                 topic: self._checked_columns(recording, topic) for topic, count in self.counts.items() if count
@@ -192,6 +198,7 @@ class RecordedRun:
             )
         with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
             files: dict[str, str] = {}
+            self._check_lost_files()
             for number, (name, data) in enumerate(self._attached.items()):
                 copy = Path(folder) / f"{number}-{Path(name).name[-60:]}"
                 copy.write_bytes(data)
@@ -208,6 +215,22 @@ class RecordedRun:
             where = f"{self.path}: its configuration does not fit this version"
             self._own = validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
             yield self._own
+
+    def _check_lost_files(self) -> None:
+        """Raise UserError for an attached file that is lost, if the file in its place now is another one."""
+        for key, recorded in self.metadata.items():
+            word, _, name = key.partition(" ")
+            if word != schema.FILE_HASH or name in self._attached:
+                continue
+            try:
+                same = hashlib.sha256(Path(name).read_bytes()).hexdigest() == recorded
+            except OSError:
+                same = False
+            if not same:
+                raise UserError(
+                    f"{self.path} has lost its copy of {name}, and the file that it was recorded with is no longer "
+                    "there; give a configuration that names such a file with --config CONFIG"
+                )
 
     def events(self) -> Iterator[RecordedEvent]:
         """Yield the events in recorded order."""
@@ -278,6 +301,8 @@ class ReplayComparison:
     awaited: set[str] = field(default_factory=set)
     before_state: Counter[tuple[str, str]] = field(default_factory=Counter)
     _foreign: int = 0
+    # Computed messages of recorded topics without a recorded one in their place.
+    _passed: int = 0
     waiting: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
     def add_computed(self, topic: str, content: Mapping[str, Any]) -> None:
@@ -296,10 +321,18 @@ class ReplayComparison:
         self.waiting = {key: waiting for key, waiting in self.waiting.items() if key[1] != source}
 
     def compare(self, event: RecordedEvent) -> None:
-        """Compare a recorded message with the oldest computed one of its topic and source."""
-        waiting = self.waiting.get((event.topic, event.source))
+        """Compare a recorded message with the computed one of its topic, source, and frame, sample or time.
+
+        Where a part of the recording is lost, either can be missing.
+        """
+        waiting = self.waiting.get((event.topic, event.source), deque())
         self.compared[event.topic] += 1
-        if not waiting:
+        key, tolerance = next(one for one in _PLACES if one[0] in event.content)
+        place = event.content[key]
+        while waiting and waiting[0][key] < place - tolerance:
+            waiting.popleft()
+            self._passed += 1
+        if not waiting or waiting[0][key] > place + tolerance:
             self._add_difference(event, "the replay did not compute it")
             return
         computed = waiting.popleft()
@@ -322,7 +355,7 @@ class ReplayComparison:
     @property
     def unrecorded(self) -> int:
         """Computed messages that are not in the recording, such as those at the moment of the daemon's stop."""
-        return self._foreign + sum(map(len, self.waiting.values()))
+        return self._foreign + self._passed + sum(map(len, self.waiting.values()))
 
     def _add_difference(self, event: RecordedEvent, text: str) -> None:
         self.different[event.topic] += 1
@@ -468,20 +501,23 @@ class Replay:
         return pairs
 
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
-        """Return frames with their recorded numbers: a later file of a run continues to count."""
-        if frames and source not in self._number_offset:
+        """Return frames with their recorded numbers: a later file of a run continues to count, as after lost input."""
+        if frames:
             # The first of several frames may have begun in the file before.
-            last, numbers = frames[-1], self._events.frame_numbers.get(source, {})
-            self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
+            number = self._events.frame_numbers[source].get(frames[-1].t_arrival_ns)
+            if number is not None:
+                self._number_offset[source] = number - frames[-1].seq
         offset = self._number_offset.get(source, 0)
         return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
 
     def _continued(self, message: messages.SkinShear) -> messages.SkinShear:
         """Return a message with the number of its sample in the run; the first takes the number of the nearest time."""
+        numbers = self._events.sample_numbers
         if SKIN not in self._number_offset:
-            numbers = self._events.sample_numbers
             nearest = min(numbers, key=lambda t_ns: abs(t_ns - message.t_mono_ns), default=None)
             self._number_offset[SKIN] = 0 if nearest is None else numbers[nearest] - message.sample
+        elif message.t_mono_ns in numbers:
+            self._number_offset[SKIN] = numbers[message.t_mono_ns] - message.sample
         return replace(message, sample=message.sample + self._number_offset[SKIN])
 
     async def _estimate(self, source: str, *frames: Frame) -> None:

@@ -15,6 +15,7 @@ from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.monotonic_times import MonotonicTimes
 from shearloop.tools.recordings.reader import reading
 from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, recorded_topic
+from shearloop.tools.recordings.repair import REPAIRED_METADATA, lost_in_repair
 
 # Fewer messages, or a shorter time, say nothing of a rate.
 MIN_RATED_MESSAGES, MIN_RATED_S = 3, 1.0
@@ -72,6 +73,9 @@ class RecordingSummary(FileCondition):
     # Whether the same code made it, so that a replay must be equal bit for bit.
     same_code: bool
     experiments: list[str]
+    # The file that a copy was repaired from, and the messages by topic that were lost there.
+    repaired_from: str | None
+    lost_in_repair: dict[str, int]
     # The tool's diameter in mm as the recording names it.
     tool_mm: str | None
     metadata: dict[str, str]
@@ -112,8 +116,10 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
             topic.rate_hz = (topic.messages - 1) / lasts_s
     first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
     ends = named.get(schema.END_METADATA, [])
+    repaired = named.get(REPAIRED_METADATA, [{}])[-1]
     with reading(path):
         dropped = int(ends[-1].get("dropped", "0")) if ends else None
+        lost_before = lost_in_repair(repaired)
     metadata = records.identity or named.get(schema.METADATA, [{}])[-1]
     experiments = named.get(schema.EXPERIMENT_METADATA, [])
     return RecordingSummary(
@@ -131,6 +137,8 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         duration_s=0.0 if first_unix_ns is None else (max(last for _, last in spans.values()) - first_unix_ns) / 1e9,
         same_code=metadata.get("code_sha256") == schema.code_digest(),
         experiments=[experiment.get("name", "") for experiment in experiments],
+        repaired_from=repaired.get("source"),
+        lost_in_repair=lost_before,
         tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
         metadata=metadata,
         attachments=attachments,

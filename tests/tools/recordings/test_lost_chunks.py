@@ -102,12 +102,14 @@ def test_only_the_messages_of_a_damaged_chunk_are_missing(number, closed, place,
     summary = summarise(path)
     assert (summary.lost, summary.damaged_chunks) == (result.lost, result.damaged_chunks)
     assert len(list(read_messages(result.path, sorted({topic for topic, _ in everything})))) == result.messages
-    assert summarise(result.path).lost == {}, "what is repaired is whole"
+    copy = summarise(result.path)
+    assert copy.lost == {}, "what is repaired is whole"
+    assert (copy.repaired_from, copy.lost_in_repair) == (str(path), result.lost)
     with result.path.open("rb") as file:
         assert [one.name for one in make_reader(file).iter_attachments()] == [CONFIGURATION]
 
 
-def test_a_topic_defined_in_the_first_chunk_only_is_taken_from_the_index(tmp_path):
+def test_a_topic_defined_in_the_first_chunk_only_is_taken_from_the_index(tmp_path, ran):
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=1)
@@ -126,6 +128,12 @@ def test_a_topic_defined_in_the_first_chunk_only_is_taken_from_the_index(tmp_pat
     result = repair(path)
     assert (result.messages, result.lost) == (4, {"load.torque": 1})
     assert messages(result.path) == {("load.torque", number) for number in range(1, 5)}
+    # A copy that is repaired again, here because its end is torn off, still names what is lost.
+    copy = result.path
+    copy.write_bytes(copy.read_bytes()[:-20])
+    again = repair(copy)
+    assert summarise(again.path).lost_in_repair == {"load.torque": 1}
+    assert f"the repaired copy of {copy}; lost there: 1 of load.torque" in ran("recording", "info", again.path).out
 
 
 def test_bytes_of_a_damaged_chunk_that_look_like_a_record_cost_no_other_chunk(tmp_path):

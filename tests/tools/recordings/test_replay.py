@@ -4,6 +4,7 @@ import json
 import math
 import os
 import re
+import shutil
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection
 from contextlib import asynccontextmanager
@@ -25,7 +26,7 @@ from shearloop.daemon.control.fingertip_diameters import FingertipDiameters
 from shearloop.daemon.messaging.messages import EitEstimate, EitHeatmap, wire_map, with_packed_arrays
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recorder.recorder import Recorder, daemon_identity
-from shearloop.daemon.recorder.schema import message_json, recorded_topic
+from shearloop.daemon.recorder.schema import CONFIGURATION, message_json, recorded_topic
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensors import open_sessions
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -411,9 +412,9 @@ def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran)
         assert int(estimates[1]) > 8, path
 
 
-def without_states(path: Path) -> Path:
-    """Return a copy of a recording without the states that it begins with."""
-    copy = path.with_name("without.mcap")
+def copy_of(path: Path, keeps: Callable[[str, dict[str, Any]], bool], *, attachments: bool = True) -> Path:
+    """Return a copy of a recording, of the messages whose topic and content it `keeps`."""
+    copy = path.with_name("copy.mcap")
     with path.open("rb") as source, copy.open("wb") as target:
         reader, writer = make_reader(source), McapWriter(target)
         writer.start()
@@ -426,9 +427,10 @@ def without_states(path: Path) -> Path:
                 channels[channel.id] = writer.register_channel(
                     channel.topic, channel.message_encoding, schemas[own.id], channel.metadata
                 )
-            if json.loads(message.data).get("kind") != InputKind.STATE.value:
+            if keeps(channel.topic, json.loads(message.data)):
                 writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        for one in reader.iter_attachments():
+        kept = (one for one in reader.iter_attachments() if attachments or one.name == CONFIGURATION)
+        for one in kept:
             writer.add_attachment(one.create_time, one.log_time, one.name, one.media_type, one.data)
         for one in reader.iter_metadata():
             writer.add_metadata(one.name, one.metadata)
@@ -436,14 +438,58 @@ def without_states(path: Path) -> Path:
     return copy
 
 
+def is_no_state(_topic: str, content: dict[str, Any]) -> bool:
+    return content.get("kind") != InputKind.STATE.value
+
+
 def test_a_check_fails_for_a_source_whose_state_is_missing(config, tmp_path, ran):
     """A daemon that was killed too soon leaves such a file."""
     asyncio.run(record_experiments(config(recording={"folder": "recordings"}, right=PLAYED)))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
     publish = ("--publish", f"ipc://{tmp_path}/replay")
-    out, said = ran("replay", without_states(later), "--speed", "max", *publish, "--check", "--json", status=1)
+    out, said = ran("replay", copy_of(later, is_no_state), "--speed", "max", *publish, "--check", "--json", status=1)
     assert "Nothing of right was compared: the recording has no state of it" in said
     result = json.loads(out.splitlines()[-1])
     assert result["without_state"] == ["right"]
     assert result["before_state"]["eit.frame.right"] > ENOUGH - BEGUN - 10
     assert result["different"] == {}
+
+
+@pytest.mark.parametrize("lost", [("eit.",), ("eit.", "input.right")], ids=["messages", "messages and their input"])
+def test_after_a_lost_part_each_message_is_compared_with_its_own(lost, config, tmp_path):
+    """A repaired copy has such holes; compared by their order, all messages after one are different."""
+    published = asyncio.run(record(config(recording={"folder": "recordings"}, right=PLAYED)))
+    times = [content["t_mono_ns"] for topic, content in published if topic == "eit.frame"]
+    hole = range(times[len(times) // 2], times[len(times) // 2 + 8])
+
+    def is_kept(topic: str, content: dict[str, Any]) -> bool:
+        return not (topic.startswith(lost) and content["t_mono_ns"] in hole)
+
+    (path,) = (tmp_path / "recordings").iterdir()
+    _, comparison = asyncio.run(replayed(copy_of(path, is_kept), math.inf))
+    assert comparison.compared["eit.frame"] == len(times) - len(hole_of(times, hole))
+    assert "did not compute" not in "".join(comparison.examples)
+    if lost == ("eit.",):
+        assert comparison.different == {}
+        assert comparison.unrecorded >= 2 * len(hole_of(times, hole))
+    else:
+        # The time between is unknown to the frames' clock, and their numbers are as recorded.
+        assert "frame was" not in "".join(comparison.examples)
+
+
+def hole_of(times: list[int], hole: range) -> list[int]:
+    return [t_ns for t_ns in times if t_ns in hole]
+
+
+def test_a_lost_calibration_is_replaced_only_by_the_same_one(config, tmp_path, tiny_calibration, ran, mistake):
+    calibration = Path(shutil.copy(tiny_calibration, tmp_path / "own.cal"))
+    right = {**PLAYED, "calibration": str(calibration)}
+    asyncio.run(record(config(recording={"folder": "recordings"}, right=right)))
+    (path,) = (tmp_path / "recordings").iterdir()
+    copy = copy_of(path, lambda *_: True, attachments=False)
+    replay = ("recording", "replay", copy, "--speed", "max", "--check")
+    ran(*replay)
+    calibration.write_bytes(calibration.read_bytes() + b" ")
+    assert f"has lost its copy of {calibration}" in mistake(*replay)
+    calibration.unlink()
+    assert f"has lost its copy of {calibration}" in mistake(*replay)

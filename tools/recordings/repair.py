@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from mcap.records import Attachment, Channel, Message, Metadata
 from mcap.writer import Writer
@@ -58,43 +59,9 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
     check_new(out)
     records = IntactRecords(source, progress)
-    schemas: dict[str, int] = {}
-    channels: dict[int, int] = {}
-    identity: dict[str, str] = {}
-    lost: Counter[str] = Counter()
-    messages = 0
     try:
         with replace_file(out) as file:
-            writer = new_writer(file)
-            for record in records:
-                # The copy has its own header and index.
-                match record:
-                    case Message():
-                        channel = records.channels[record.channel_id]
-                        if channel.id not in channels:
-                            channels[channel.id] = _registered(writer, channel, records, schemas)
-                        copied = channels[channel.id], record.log_time, record.data, record.publish_time
-                        writer.add_message(*copied, record.sequence)
-                        messages += 1
-                    case Metadata(name=name) if name == REPAIRED_METADATA:
-                        lost.update(lost_in_repair(record.metadata))
-                    case Metadata(name=schema.METADATA):
-                        identity = record.metadata
-                    case Metadata():
-                        writer.add_metadata(record.name, record.metadata)
-                    case Attachment():
-                        writer.add_attachment(
-                            record.create_time, record.log_time, record.name, record.media_type, record.data
-                        )
-            # The record has no checksum; the chunks have one.
-            identity = records.identity or identity
-            if identity:
-                writer.add_metadata(schema.METADATA, identity)
-            # Without an index the numbers of the messages are all that shows a loss, and show an earlier one again.
-            lost = lost + Counter(records.lost) if records.is_indexed else lost | Counter(records.lost)
-            if records.is_damaged or lost:
-                writer.add_metadata(REPAIRED_METADATA, {"source": str(source), "lost": json.dumps(lost)})
-            writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
+            messages = _copy(records, source, file)
             if not messages:
                 raise UserError(f"{source}: {NOTHING_INTACT}")
     except OSError as error:
@@ -109,6 +76,43 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         being_written,
         records.is_damaged,
     )
+
+
+def _copy(records: IntactRecords, source: Path, file: BinaryIO) -> int:
+    """Write the intact records, with a header and an index of the copy's own; return the number of messages."""
+    writer = new_writer(file)
+    schemas: dict[str, int] = {}
+    channels: dict[int, int] = {}
+    identity: dict[str, str] = {}
+    lost: Counter[str] = Counter()
+    messages = 0
+    for record in records:
+        match record:
+            case Message():
+                channel = records.channels[record.channel_id]
+                if channel.id not in channels:
+                    channels[channel.id] = _registered(writer, channel, records, schemas)
+                copied = channels[channel.id], record.log_time, record.data, record.publish_time
+                writer.add_message(*copied, record.sequence)
+                messages += 1
+            case Metadata(name=name) if name == REPAIRED_METADATA:
+                lost.update(lost_in_repair(record.metadata))
+            case Metadata(name=schema.METADATA):
+                identity = record.metadata
+            case Metadata():
+                writer.add_metadata(record.name, record.metadata)
+            case Attachment():
+                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+    # The record has no checksum; the chunks have one.
+    identity = records.identity or identity
+    if identity:
+        writer.add_metadata(schema.METADATA, identity)
+    # Without an index the numbers of the messages are all that shows a loss, and show an earlier one again.
+    lost = lost + Counter(records.lost) if records.is_indexed else lost | Counter(records.lost)
+    if records.is_damaged or lost:
+        writer.add_metadata(REPAIRED_METADATA, {"source": str(source), "lost": json.dumps(lost)})
+    writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
+    return messages
 
 
 def lost_in_repair(metadata: Mapping[str, str]) -> dict[str, int]:

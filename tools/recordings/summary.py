@@ -110,16 +110,13 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
                 named.setdefault(record.name, []).append(dict(record.metadata))
             case Attachment():
                 attachments.append(record.name)
-    for name, (first_ns, last_ns) in spans.items():
-        topic, lasts_s = topics[name], (last_ns - first_ns) / 1e9
-        if topic.messages >= MIN_RATED_MESSAGES and lasts_s >= MIN_RATED_S:
-            topic.rate_hz = (topic.messages - 1) / lasts_s
+    for name, span in spans.items():
+        topics[name].rate_hz = _rate_hz(topics[name].messages, *span)
     first_unix_ns = min((first_ns for first_ns, _ in spans.values()), default=None)
     ends = named.get(schema.END_METADATA, [])
     repaired = named.get(REPAIRED_METADATA, [{}])[-1]
     with reading(path):
         dropped = int(ends[-1].get("dropped", "0")) if ends else None
-        lost_before = lost_in_repair(repaired)
     metadata = records.identity or named.get(schema.METADATA, [{}])[-1]
     experiments = named.get(schema.EXPERIMENT_METADATA, [])
     return RecordingSummary(
@@ -138,17 +135,27 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         same_code=metadata.get("code_sha256") == schema.code_digest(),
         experiments=[experiment.get("name", "") for experiment in experiments],
         repaired_from=repaired.get("source"),
-        lost_in_repair=lost_before,
+        lost_in_repair=lost_in_repair(repaired),
         tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
         metadata=metadata,
         attachments=attachments,
         topics=dict(sorted(topics.items())),
-        clock_steps=[
-            RecordedStep(step.set_s, step.suspended_s, (t_ns - (first_unix_ns or 0)) / 1e9)
-            for (_, before), (t_ns, after) in pairwise(readings)
-            if (step := ClockStep.between(before, after)) is not None
-        ],
+        clock_steps=_clock_steps(readings, first_unix_ns or 0),
     )
+
+
+def _clock_steps(readings: list[tuple[int, ClockReading]], first_unix_ns: int) -> list[RecordedStep]:
+    return [
+        RecordedStep(step.set_s, step.suspended_s, (t_ns - first_unix_ns) / 1e9)
+        for (_, before), (t_ns, after) in pairwise(readings)
+        if (step := ClockStep.between(before, after)) is not None
+    ]
+
+
+def _rate_hz(messages: int, first_ns: int, last_ns: int) -> float | None:
+    """Return the rate of a topic, None where it has too few messages, or for too short a time."""
+    lasts_s = (last_ns - first_ns) / 1e9
+    return (messages - 1) / lasts_s if messages >= MIN_RATED_MESSAGES and lasts_s >= MIN_RATED_S else None
 
 
 def named_unix_ns(path: Path) -> int | None:

@@ -22,7 +22,7 @@ from shearloop.cli.options import (
     run_action,
 )
 from shearloop.cli.output_paths import output_path
-from shearloop.cli.terminal import print_result, table
+from shearloop.cli.terminal import one_line, print_result, table
 from shearloop.errors import UserError
 from shearloop.tools.outputs import check_new, check_overwrite, progress_bar, writing
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
@@ -178,7 +178,7 @@ def _summary_text(found: "RecordingSummary") -> str:
     if found.dropped:
         dropped = counted(found.dropped, "message was", "messages were")
         lines.append(f"  {dropped} dropped because the disk was too slow.")
-    return "\n".join(lines)
+    return "\n".join(map(one_line, lines))
 
 
 def _other_keys(found: "RecordingSummary") -> list[str]:

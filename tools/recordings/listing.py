@@ -4,15 +4,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mcap.reader import make_reader
+from mcap.writer import MCAP0_MAGIC
 
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.recorder.writer import PARTIAL
 from shearloop.errors import UserError
 from shearloop.files import open_file
 from shearloop.tools.recordings.being_written import is_being_written
+from shearloop.tools.recordings.intact_records import check_magic, intact_index
 from shearloop.tools.recordings.monotonic_times import has_one_offset
 from shearloop.tools.recordings.reader import reading
 from shearloop.tools.recordings.summary import summarise
+
+_BAD_INDEX = "its index is damaged; `shearloop recording repair` makes a copy with a new one"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +53,14 @@ def _listed(path: Path) -> ListedRecording:
         return ListedRecording(str(path), size, closed=False, being_written=is_being_written(path))
     try:
         with reading(path), open_file(path) as file:
-            reader = make_reader(file)
-            summary = reader.get_summary()
-            if summary is None or summary.statistics is None:
-                return ListedRecording(str(path), size, closed=False)
-            counts = summary.statistics
+            check_magic(path, file)
+            found = intact_index(file, size)
+            if found is None or found[0].statistics is None:
+                file.seek(max(size - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
+                closed = file.read() == MCAP0_MAGIC
+                return ListedRecording(str(path), size, closed=closed, unreadable=_BAD_INDEX if closed else "")
+            reader, (summary, _) = make_reader(file), found
+            counts = found[0].statistics
             experiments = [record for record in reader.iter_metadata() if record.name == schema.EXPERIMENT_METADATA]
             follows_wall_clock = any(
                 channel.topic == schema.CLOCK_TOPIC and not has_one_offset(channel.metadata)

@@ -71,6 +71,15 @@ def test_a_few_messages_or_a_short_time_have_no_rate(times_s, rate_hz, tmp_path,
     assert (" Hz" in ran("recording", "info", tmp_path / "a.mcap").out) is (rate_hz is not None)
 
 
+def test_info_has_one_line_for_each_name(tmp_path, ran):
+    """An experiment's name may hold a line feed, and would begin a line that nothing said."""
+    path = tmp_path / "a.mcap"
+    with new_recording(path, "a bench\n  EMULATED") as writer:
+        writer.add_torque(10**18, 0.1)
+    said = ran("recording", "info", path).out
+    assert "  source   a bench\\u000a  EMULATED\n" in said
+
+
 @pytest.mark.parametrize(
     ("name", "begun"),
     [
@@ -89,6 +98,16 @@ def test_info_explains_a_first_message_from_before_the_time_in_the_name(name, be
     said = ran("recording", "info", path).out
     assert ("by its name; what was measured up to 2.5 s before waited for it" in said) is begun
     assert (":46:18 " in said) is begun
+
+
+@pytest.mark.parametrize(
+    ("content", "remark"),
+    [(lambda whole: whole[:8], "not closed"), (lambda whole: whole[:-40] + b"?" + whole[-39:], "index is damaged")],
+    ids=["begun", "damaged"],
+)
+def test_list_says_what_is_wrong_with_a_file_without_an_index(content, remark, recording, tmp_path, ran):
+    recording.write_bytes(content(recording.read_bytes()))
+    assert remark in ran("recording", "list", tmp_path).out
 
 
 def test_list_shows_the_recordings_of_a_folder_with_what_is_known_of_each(recording, tmp_path, ran, mistake):

@@ -333,7 +333,7 @@ class DaemonConfig(ConfigModel):
     )
     recording: RecordingConfig | None = Field(None, description="where to record; default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
-    emulators: tuple[EmulatorConfig, ...] = Field((), description="devices to emulate, for demonstrations")
+    emulators: tuple[EmulatorConfig, ...] = Field((), description="devices that are emulated; needs `emulated`")
     _file: Path | None = PrivateAttr(None)
 
     @field_validator("experiments")
@@ -392,11 +392,11 @@ class DaemonConfig(ConfigModel):
             )
         if self.autostart and self.experiment is None:
             raise ValueError("`autostart` starts no experiment: name one in `experiment`, or take `autostart` out")
-        if self.emulated:
-            real = next(self._real_devices(), None)
-            if real is not None:
-                key, device = real
+        for key, device in self._real_devices():
+            if self.emulated:
                 raise ValueError(f"`emulated: true` and `{key}: {device}`, a real device: take one of the two out")
+        if self.emulators and not self.emulated:
+            raise ValueError("`emulators` play devices: add `emulated: true`, or take the emulators out")
         return self
 
     @model_validator(mode="after")

@@ -111,6 +111,10 @@ def test_check_and_run_say_the_same_of_a_file_of_another_kind(name, mistake):
             {"autostart": True, "experiment": "one.yaml", "robot": "ur.yaml"},
             ["`autostart` moves the robot without a command"],
         ),
+        (
+            {"emulators": [{"device": "hx711", "arguments": ["--link", "load"]}], "emulated": False},
+            ["`emulators` play devices: add `emulated: true`"],
+        ),
         ({"autostart": True, "emulated": True}, ["`autostart` starts no experiment"]),
         ({"experiment": "", "robot": "ur.yaml"}, ["experiment: must be the path of a file, not '.'"]),
         ({"robot": "a\0b"}, ["robot: must be the path of a file"]),

@@ -84,7 +84,8 @@ COMPUTING = tuple(
         )),
     )
 )  # fmt: skip
-# `make test-long` runs these files and folders, and single tests with the mark `long`; `make test` all others.
+# `make test-long` runs these files and folders, and single tests with the mark `long`, such as those that take a second
+# of a processor or more; `make test` runs all others.
 LONG = tuple(
     _TESTS / path
     for path in (

@@ -81,6 +81,7 @@ def test_the_checks_run_on_every_supported_python_and_on_both_machines():
     assert run == {"run": ".ci/run"}
 
 
+@pytest.mark.long
 def test_the_pages_become_a_site_without_a_warning(tmp_path):
     pytest.importorskip("material", reason="the site needs the extra `docs`")
     command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]

@@ -66,6 +66,7 @@ def noisy(clean, fingertip):
     return design_bank(fingertip, scene(clean, 6e-5))
 
 
+@pytest.mark.long
 def test_more_noise_asks_for_less_of_everything(quiet, noisy):
     assert noisy.relative_noise == pytest.approx(3 * quiet.relative_noise, rel=0.05)
     assert noisy.mesh.chosen.setting > quiet.mesh.chosen.setting

@@ -55,6 +55,7 @@ def test_the_mesh_covers_the_rectangle_and_electrodes_have_their_place_and_width
     assert np.diff(np.unique(mesh.nodes[:, 0])).max() <= size + 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("impedance", "low", "high"),
     [

@@ -93,6 +93,7 @@ def test_random_frames_match_as_without_pruning(slow, fast, frame):
     assert_same(fast.match(frame), slow.match(frame))
 
 
+@pytest.mark.long
 @both
 @given(
     cell=cells,
@@ -222,6 +223,7 @@ def recorded_frames(shared) -> list[np.ndarray]:
     return found
 
 
+@pytest.mark.long
 @both
 def test_recorded_frames_match_as_without_pruning(recorded_frames, slow, fast):
     """Far from anything in this bank, as they are from every bank: a hard case."""

@@ -276,6 +276,7 @@ def empty_folder(tmp_path_factory) -> Path:
     return tmp_path_factory.mktemp("programs")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("program", PROGRAMS, ids=["record", "read", "calibrate", "estimate", "match", "help"])
 def test_the_programs_of_the_python_page_and_of_help_run_one_after_another(program, empty_folder, monkeypatch, capsys):
     if ".frame(" in program:

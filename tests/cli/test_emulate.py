@@ -37,6 +37,7 @@ async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Pr
         yield process, path
 
 
+@pytest.mark.long
 async def test_a_recording_at_three_hundred_times_its_pace_arrives_whole_and_in_order(shared):
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
     expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]

@@ -212,6 +212,7 @@ def test_what_cannot_be_rehearsed_is_refused(real_rig):
         pass
 
 
+@pytest.mark.long
 async def test_a_sensor_alone_is_rehearsed_and_every_line_says_so(real_rig):
     async with shearloop(
         "run", str(real_rig("skin", "load_cell", skin=skin_of_the_demo())), "--emulate", "--show"

@@ -46,6 +46,7 @@ def next_message(socket: "zmq.Socket[bytes]") -> dict[str, Any]:
     return decode(payload)
 
 
+@pytest.mark.long
 async def test_every_frame_at_100_times_speed_becomes_an_estimate_in_order(shared, config, tmp_path, subscriber):
     play = shared / "recordings" / "streams" / "2024-12-03_16-09" / "device1.mat"
     async with shearloop("run", str(config(right=played_at(100)))) as daemon:
@@ -155,6 +156,7 @@ async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless)
         assert "Send `shearloop command unlock` before the next start." in refused["reason"]
 
 
+@pytest.mark.long
 async def test_a_crashed_estimator_restarts_and_is_reported(config, tmp_path, monkeypatch):
     estimate, frames = Session.estimate, itertools.count()
 
@@ -188,6 +190,7 @@ async def test_the_daemon_survives_a_closed_log(config, tmp_path):
         assert await daemon.wait() == 0
 
 
+@pytest.mark.long
 async def test_a_stopped_terminal_delays_no_estimate(config, tmp_path, subscriber):
     terminal, its_end = pty.openpty()
     async with shearloop("run", str(config(right=played_at(100))), "--show", stdout=its_end, stderr=its_end) as daemon:
@@ -239,6 +242,7 @@ def waiting_config(ur_rtde, config, tmp_path) -> Path:  # noqa: ARG001 - it skip
     return config(robot="ur.yaml", experiment="experiment.yaml", emulated=True, autostart=True, stop_when_done=True)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 4), (signal.SIGHUP, 0)])
 async def test_an_unfinished_experiment_sets_the_exit_status(number, status, waiting_config):

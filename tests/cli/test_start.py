@@ -261,6 +261,7 @@ def test_init_leaves_nothing_behind_on_a_full_disc(tmp_path, mistake, monkeypatc
     assert len(written) == 8
 
 
+@pytest.mark.long
 def test_the_demos_page_lasts_as_long_as_the_demo(tmp_path, monkeypatch, capsys):
     """The page's address is printed before the loop starts."""
     aiohttp = pytest.importorskip("aiohttp", reason="the live view needs the extra `view`")

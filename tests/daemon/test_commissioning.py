@@ -755,6 +755,7 @@ def test_the_robots_process_starts_again_with_the_limits_for_its_controller(tmp_
     assert robot.settings.limits.wrist_speed_rad_per_s.inner == 0.5
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ur_rtde")
 async def test_status_and_health_say_that_the_cap_holds(config, tmp_path):
     robot_at("127.0.0.9", tmp_path)

@@ -50,6 +50,7 @@ def test_another_grip_is_read_without_a_pull_to_the_mean(known):
     assert np.ptp([ridge.predict(grip(mm, 100).position).mean() for mm in read]) / 26 < 0.6
 
 
+@pytest.mark.long
 def test_intervals_hold_cylinders_that_the_line_was_not_fitted_to():
     """Within a recording all is alike: how far estimates go astray shows on cylinders that were left out."""
     inside = []

@@ -39,6 +39,7 @@ TWO_GRIPS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("recorded", TWO_GRIPS.values(), ids=TWO_GRIPS)
 def test_every_grip_of_a_recording_is_found_and_fitted(recorded):
     series = recorded()

@@ -177,6 +177,7 @@ def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded
     np.testing.assert_allclose(largest[inner], recorded.t_s[inner] / 100 + 0.005, atol=1e-9)
 
 
+@pytest.mark.long
 def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(recorded, monkeypatch):
     checked = fit("motion_regression", [recorded], "checked").torque.regressor
     monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: None)

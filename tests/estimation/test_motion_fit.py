@@ -97,6 +97,7 @@ def test_a_mean_of_ridges_predicts_the_mean():
     np.testing.assert_allclose(mean_ridge(members).predict(rows), mean)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sides", [("right", "left"), ("right",)])
 @pytest.mark.parametrize("rest", [1, 5])
 def test_twists_that_alternate_do_not_teach_their_order(rest, sides):

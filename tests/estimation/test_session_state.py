@@ -189,6 +189,7 @@ def sessions(draw):
     return frames
 
 
+@pytest.mark.long
 def test_what_is_valid_is_of_one_grip_and_hardly_made_up(motion_calibration):
     """Against a plain account of what happened: whatever frames are lost or spoilt, and whatever happens meanwhile."""
     guards, motion = motion_calibration.validators, motion_calibration.estimator.motion

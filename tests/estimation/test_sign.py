@@ -41,6 +41,7 @@ def check_mirrored(estimates: Sequence[Estimate], mirrored: Sequence[Estimate]) 
     assert sum(one.torque_nm is not None and abs(one.torque_nm) > 0.01 for one in estimates) > 10
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("estimator", ["motion_regression", "regression"])
 @pytest.mark.parametrize("timing", [None, TRUSTED])
 def test_negated_torques_give_negated_estimates(recorded, estimator, timing):

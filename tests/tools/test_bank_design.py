@@ -54,6 +54,7 @@ def step_frames() -> np.ndarray:
     return 0.01 * np.abs(simulated_signals(BatchForwardModel(mesh), "step", steps))
 
 
+@pytest.mark.long
 def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):
     frames = step_frames()
     # A third of a frame's size: a coarse mesh and few cells, built in no time.

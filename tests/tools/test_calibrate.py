@@ -97,6 +97,7 @@ class Process(contextlib.AbstractContextManager["Process", None]):
         return status, self._child.stdout.read(), self._child.stderr.read()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("script", [False, True], ids=["for a person", "for a script"])
 def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path, script):
     link, out = tmp_path / "load", tmp_path / "load.yaml"
@@ -188,6 +189,7 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path, way):
     assert found.width_mm(230) == pytest.approx(0, abs=1)
 
 
+@pytest.mark.long
 def test_a_gripper_of_a_daemon_is_refused_and_what_it_may_hold_is_said_before_it_opens(tmp_path):
     write_memory(memory_path(HOST), Remembered(force_n=60.0, running="loosen"))
     with Process("emulate", "gripper-socket", "--port", "0", "--bind", HOST) as gripper:
@@ -257,6 +259,7 @@ async def halted_mm(host: str, port: int, interrupt: Callable[[], None]) -> tupl
         await gripper.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM])
 @pytest.mark.parametrize("program", ["calibrate", "commission"])
 def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number, tmp_path):
@@ -283,6 +286,7 @@ def test_fingers_that_close_are_halted_by_the_end_of_the_program(program, number
     assert last_mm == first_mm > 20.0
 
 
+@pytest.mark.long
 def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(tmp_path):
     diameters, out = (8, 25, 45, 75), tmp_path / "gripper.yaml"
     emulated = ("--model", "2F-85", "--open-counts", "13", "--bow-mm", "2.5", "--port", "0", "--speed", "20")

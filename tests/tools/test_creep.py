@@ -35,6 +35,7 @@ def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear():
     np.testing.assert_allclose(found, torques, atol=4e-4)
 
 
+@pytest.mark.long
 def test_noise_shifts_neither_the_time_nor_the_scale_but_widens_what_is_found():
     """Fitted the other way round, torque to readings, 12 mN·m of noise make 20 s 50 s and the scale 0.95."""
     times, shears, torques = twisted(600.0)

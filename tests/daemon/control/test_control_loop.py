@@ -165,6 +165,7 @@ def test_each_message_has_the_step_that_its_activity_belongs_to():
     assert [activity for activity, steps in told.items() if len(steps) > 1] == []
 
 
+@pytest.mark.long
 def test_tool_that_was_turned_after_an_experiment_is_identified_again():
     rig = started(Rig(new_loop()), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.15, "hold_s": 60})
     while not rig.control_loop.experiment.command.hold_number:

@@ -101,6 +101,7 @@ class Bench:
         await self.look()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("state", STATES)
 async def test_no_tool_drops_unasked(state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     step_model = Gripper.step

@@ -69,6 +69,7 @@ def _durations_hold(file: ExperimentFile, run: Run, *, wrist_is_known: bool) -> 
             assert max(map(abs, run.moves), default=0.0) <= said.angle_rad + 1e-9, said
 
 
+@pytest.mark.long
 @given(content=st.one_of(CLAMPED, GRIPPED), seed=st.integers(0, 2**32), wrist_is_known=st.booleans())
 @settings(max_examples=400, deadline=None)
 def test_no_step_takes_longer_than_the_plan_says_and_a_time_without_a_note_is_right(content, seed, wrist_is_known):

@@ -225,6 +225,7 @@ def _holds_in(file: ExperimentFile, run: Run) -> None:
             last = None
 
 
+@pytest.mark.long
 @given(content=CLAMPED, seed=st.integers(0, 2**32))
 @settings(max_examples=400, deadline=None)
 def test_what_the_plan_says_of_a_clamped_tool_holds_in_every_run(content, seed):
@@ -233,6 +234,7 @@ def test_what_the_plan_says_of_a_clamped_tool_holds_in_every_run(content, seed):
         _holds_in(file, Run(random.Random(seed + number), clamped=True, reaches=True))
 
 
+@pytest.mark.long
 @given(begins=st.sampled_from([[], [_RELEASE], [_RELEASE, {"do": "turn_to", "angle_rad": 0.1}]]), content=GRIPPED,
        seed=st.integers(0, 2**32))  # fmt: skip
 @settings(max_examples=400, deadline=None)
@@ -242,6 +244,7 @@ def test_what_the_plan_says_of_a_gripped_tool_holds_in_every_run(begins, content
         _holds_in(file, Run(random.Random(seed + number), clamped=False, reaches=True))
 
 
+@pytest.mark.long
 @given(content=CLAMPED, seed=st.integers(0, 2**32), twisted_rad=st.sampled_from([0.0, 0.01, 0.4]),
        loaded=st.booleans(), wrist_is_known=st.booleans())  # fmt: skip
 @settings(max_examples=400, deadline=None)

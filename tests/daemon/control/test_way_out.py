@@ -82,6 +82,7 @@ async def test_a_tool_is_released_after_any_stop_and_without_an_experiment(befal
         assert cell.gripper.asked == ["open"]
 
 
+@pytest.mark.long
 async def test_a_way_out_loads_nothing_that_an_upgrade_in_place_has_replaced(monkeypatch):
     with_the_rig = set(loaded_by_run(robot=True).modules)
     for name in list(sys.modules):

@@ -43,6 +43,7 @@ def test_a_held_angle_is_kept():
     assert max(errors_rad[375:]) < 1.1 * CLOSE_RAD
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("allowed_rad_per_s", [1e-5, 4e-5, 1e-3, 0.2])
 @pytest.mark.parametrize("bandwidth_per_s", [0.02, 5.0, 40.0])
 def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(allowed_rad_per_s, bandwidth_per_s):

@@ -57,6 +57,7 @@ def descriptors() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("descriptors")
 @pytest.mark.parametrize("key", ["publish", "commands"])
 async def test_stop_is_fast_in_a_flood_of_idle_connections(key, config):

@@ -171,6 +171,7 @@ def test_a_daemon_without_a_message_leaves_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path):
     """Fifty recorders, each killed at a random moment of its first two seconds."""
     killed = subprocess.run(

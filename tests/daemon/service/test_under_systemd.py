@@ -53,6 +53,7 @@ def booted(folder: Path, bank: Path, *options: str) -> dict[str, list[str]]:
     return seen
 
 
+@pytest.mark.long
 def test_the_service_starts_and_restarts_after_kill_and_hang_but_not_after_a_mistake(tmp_path, tiny_bank):
     seen = booted(tmp_path, tiny_bank)
     assert seen["started"] == ["0"], "READY=1 came, and ZeroMQ could make its threads and sockets"
@@ -66,6 +67,7 @@ def test_the_service_starts_and_restarts_after_kill_and_hang_but_not_after_a_mis
     assert seen["mistake"] == ["status 2, 0 restarts"]
 
 
+@pytest.mark.long
 def test_the_service_starts_with_the_real_time_options(tmp_path, tiny_bank):
     (tmp_path / "start_only").touch()
     seen = booted(tmp_path, tiny_bank, "--real-time")

@@ -554,6 +554,7 @@ async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path):
                 await serve(DaemonAddress(publish, commands), 0, TOKEN, tip, ready)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("default_signals")
 async def test_view_prints_its_address_and_ends_on_a_signal(tmp_path):
     token = tmp_path / "token"
@@ -704,6 +705,7 @@ async def page_of(places: dict[str, str], folder: Path, who: str | None) -> Asyn
         yield Page(http, printed["url"].rstrip("/"), printed["url_with_token"].partition("#token=")[2])
 
 
+@pytest.mark.long
 async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(config, places, tmp_path):
     curve = {"server_key": str(tmp_path / "keys/server.key_secret"), "clients": str(tmp_path / "keys/clients")}
     async with running_daemon(config(**places, curve=curve)) as daemon:

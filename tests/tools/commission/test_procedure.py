@@ -134,6 +134,7 @@ def failed(report) -> list[str]:
     return [line.what for stage in report.stages for line in stage.lines if line.verdict == "failed"]
 
 
+@pytest.mark.long
 def test_the_whole_procedure_runs_unattended_and_its_report_supplies_what_it_measured(lab):
     lab.operator.declined = "wrist 3 turns 4 times"
     with pytest.raises(DeclinedError, match="is kept"):
@@ -164,6 +165,7 @@ def emulated_lab(tmp_path) -> Iterator[Lab]:
     lab.close()
 
 
+@pytest.mark.long
 def test_an_emulated_rig_with_its_long_deadlines_passes_and_says_so(emulated_lab):
     """The wrist turns on to the end of its range where a real one has stopped before."""
     report, page = emulated_lab.run("4")
@@ -212,6 +214,7 @@ def test_each_seeded_fault_turns_its_own_line_red(lab, fault, stage, line):
     assert load_report(lab.path.with_name("report.yaml")) == report
 
 
+@pytest.mark.long
 def test_the_torque_of_a_gel_that_creeps_is_compared_without_its_creep(lab):
     """The emulated gel does not creep, so a configured creep takes half of its torque away."""
 
@@ -233,6 +236,7 @@ def skin_lab(tmp_path) -> Iterator[Lab]:
     lab.close()
 
 
+@pytest.mark.long
 def test_a_rig_with_a_skin_alone_runs_unattended(skin_lab):
     report, _ = skin_lab.run()
     assert failed(report) == []
@@ -306,6 +310,7 @@ def test_an_active_gripper_is_activated_as_its_question_says_and_the_time_is_mea
     assert float(line.value.split()[0]) > 0.1
 
 
+@pytest.mark.long
 def test_the_bounds_are_about_the_confirmed_pose_also_where_the_arm_was_moved_by_hand_before(lab):
     """The robot is driven from stage 1 on, and the pose is confirmed in stage 3."""
     lab.move_by_hand(0.08, before="object none")
@@ -390,6 +395,7 @@ def test_a_program_that_replaced_the_commissionings_is_asked_about_before_the_ne
         assert lab.operator.asked == [], "the program may be another daemon's, and the worker refuses to end it"
 
 
+@pytest.mark.long
 def test_an_emergency_stop_of_a_wrist_that_stands_is_none(lab):
     """A swing ends by itself while nobody presses."""
     lab.do_instead("emergency-stop", [["object none"] * 80 + ["emergency-stop"]])

@@ -45,6 +45,7 @@ def dies_once(folder: str, item: int) -> int:
     return item * item
 
 
+@pytest.mark.long
 def test_all_executors_give_the_same_numbers(scheduler):
     items, shared = list(range(12)), {"factor": 0.37}
     alone = list(SerialExecutor().map(square, shared, items))
@@ -204,6 +205,7 @@ def test_evaluate_gives_the_same_figures_on_a_cluster(scheduler, shared, tmp_pat
     assert figures[0] == figures[1]
 
 
+@pytest.mark.long
 def test_a_bank_of_a_cluster_has_the_same_bytes(bank, scheduler):
     again, config = bank.with_name("there.bank"), str(bank.with_name("bank.yaml"))
     assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0

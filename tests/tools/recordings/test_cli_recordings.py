@@ -119,6 +119,7 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads):
     assert result.figures()["sees_loads"] is not misses_loads
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("slices_folder", [0.5], indirect=True)
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, ran, monkeypatch, result_of):
     fitted = []

@@ -321,6 +321,7 @@ def check(one: Recorded, out: Path, ran: Any, mistake: Any) -> None:
         check_replay(one)
 
 
+@pytest.mark.long
 def test_every_export_gives_back_every_topic_with_empty_keys_and_odd_texts(tmp_path, ran, mistake):
     one = made(tmp_path)
     assert {live_topic(topic) for topic in one.rows()} >= set(TOPICS)
@@ -348,6 +349,7 @@ async def absent(path: Path) -> Published:
     return published
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("ur_rtde")
 def test_every_export_gives_back_a_recording_with_absent_devices(config, tmp_path, ran, mistake):
     robot_at(own_address(5), tmp_path)

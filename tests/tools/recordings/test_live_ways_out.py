@@ -3,6 +3,8 @@
 import asyncio
 from pathlib import Path
 
+import pytest
+
 from shearloop.daemon.web.message_store import CHARTED
 from tests.fixtures.daemons import emulated_kit, played_at, running_daemon, shearloop
 from tests.tools.recordings.every_message import Published, Recorded, latest_recording
@@ -35,6 +37,7 @@ async def run_watched(config: Path, folder: Path) -> tuple[Published, Watched]:
     return published, watched
 
 
+@pytest.mark.long
 def test_listen_and_the_page_give_what_was_recorded(config, tmp_path):
     path = config(
         right=played_at(20),

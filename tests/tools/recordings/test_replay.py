@@ -117,6 +117,7 @@ async def record(config: Path) -> Messages:
     return published
 
 
+@pytest.mark.long
 def test_a_replay_equals_the_recording_at_any_speed(config, tmp_path, tiny_calibration, ran):
     live = asyncio.run(record(config(recording={"folder": "recordings"}, right=PLAYED)))
     (path,) = (tmp_path / "recordings").iterdir()
@@ -153,6 +154,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callabl
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
 
 
+@pytest.mark.long
 def test_a_real_recording_gives_the_stored_estimates(shared, config, tmp_path, monkeypatch):
     """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
     path = tmp_path / "stream.mcap"
@@ -401,6 +403,7 @@ async def record_run(config: Path, per_experiment: int) -> None:
             assert published
 
 
+@pytest.mark.long
 def test_each_of_a_daemons_recordings_replays_bit_for_bit(config, tmp_path, ran):
     asyncio.run(record_run(config(recording={"folder": "recordings"}, right=PLAYED), 18))
     paths = list((tmp_path / "recordings").iterdir())

@@ -15,7 +15,14 @@ from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.series import distinct
 from shearloop.estimation.values import Measured
-from shearloop.tools.frame_series import check_no_copies, check_paths_differ, part_of, read_series, series_of
+from shearloop.tools.frame_series import (
+    check_no_copies,
+    check_paths_differ,
+    check_tool_counts,
+    part_of,
+    read_series,
+    series_of,
+)
 from shearloop.tools.recordings.frames import read_recording
 
 
@@ -171,6 +178,7 @@ def read_parts(
         others += [(f"{path.name}, {series.sides[0]}", part_of(series, *time_range)) for series in not_fitted]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
+    check_tool_counts([(str(path), part) for path, part in chosen], tool_mm)
     if load_cell_delay_s:
         parts = [replace(part, torque_t_s=part.torque_t_s - load_cell_delay_s) for part in parts]
     timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [part for _, part in others])
@@ -202,6 +210,7 @@ def adapt_to_recordings(
     start, stop = time_range
     named = [(str(path), recording) for path in paths for recording in read_series(path, calibration.sides, tool_mm)]
     check_no_copies(named)
+    check_tool_counts(named, tool_mm)
     series = [recording for _, recording in named]
     # Earlier frames show the session the idle fingertip.
     until = [

@@ -189,6 +189,18 @@ def check_paths_differ(paths: Sequence[Path]) -> None:
             raise UserError(f"{path} is given twice{also}; name it once: a copy adds nothing")
 
 
+def check_tool_counts(series: Sequence[tuple[str, FrameSeries]], tool_mm: float | None) -> None:
+    """Raise UserError for a stated diameter that no recording takes, because each names another."""
+    tools = [(name, recording.tool_mm) for name, recording in series]
+    if tool_mm is None or any(tool is None or tool.value == tool_mm for _, tool in tools):
+        return
+    name, tool = next((name, tool) for name, tool in tools if tool is not None)
+    raise UserError(
+        f"{name} names its tool, of {tool.value:g} mm, and --tool-mm {tool_mm:g} counts only where nothing names one: "
+        "leave it out, or import or record again under the right diameter"
+    )
+
+
 def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:
     """Raise UserError for named recordings that share most of their frames.
 

@@ -15,9 +15,11 @@ def cylinder(shared, tmp_path, ran):
     """Return a function that imports the recorded grip of a cylinder, and returns its path."""
 
     def imported(name):
-        files = [shared / "recordings" / "streams" / "cylinders" / f"{name}_{what}.mat" for what in ("right", "truth")]
-        ran("recording", "import", "mat", *files, "--out", tmp_path / f"{name}.mcap")
-        return tmp_path / f"{name}.mcap"
+        path, folder = tmp_path / f"{name}.mcap", shared / "recordings" / "streams" / "cylinders"
+        if not path.exists():
+            files = [folder / f"{name}_{what}.mat" for what in ("right", "truth")]
+            ran("recording", "import", "mat", *files, "--out", path)
+        return path
 
     return imported
 

@@ -40,7 +40,7 @@ from shearloop.estimation.series import FrameSeries, check_finite, distinct
 from shearloop.estimation.session import AMBIGUOUS, Session
 from shearloop.estimation.torque_profile import TorqueProfile
 from shearloop.estimation.twists import LOADED_FRACTION, first_twists, loaded_log_gain
-from shearloop.estimation.validator_fit import GripParts, fit_validator, too_few_frames
+from shearloop.estimation.validator_fit import MIN_IDLE, GripParts, fit_validator, too_few_frames
 from shearloop.estimation.values import GripState, Measured
 from shearloop.words import CountedReasons, counted
 
@@ -154,8 +154,20 @@ def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:
     grips = find_grips(recording)
     few = [too_few_frames(grip.idle.stop - grip.idle.start, grip.gripped.stop - grip.gripped.start) for grip in grips]
     if all(few):
-        raise CalibrationError(f"recording {number} of {of}: {few[0]}")
+        raise CalibrationError(f"recording {number} of {of}: {_loaded_at_first(recording) or few[0]}")
     return [grip for grip, why in zip(grips, few, strict=True) if not why]
+
+
+def _loaded_at_first(recording: FrameSeries) -> str:
+    """Return why no frame is idle where the load cell shows a torque from the first frame on, else nothing."""
+    torque = recording.torque_at_frames()
+    first = torque[np.isfinite(torque)][:MIN_IDLE]
+    if not len(first) or np.abs(first).min() <= LOADED_FRACTION * np.nanmax(np.abs(torque)):
+        return ""
+    return (
+        f"the load cell shows {np.median(first):+.3f} N·m from the first frame on, so that none is idle: take its zero "
+        "before the grip (`shearloop command tare`), begin some seconds before gripping, and record again"
+    )
 
 
 def _fit_outputs(

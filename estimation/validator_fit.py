@@ -24,7 +24,7 @@ _STEP_MARGIN = 1.25
 # A grip scores above the idle frames by this many standard deviations, and by at least this fraction of the calibrated
 # grip. Idle frames of other sessions score at most 0.06, their grips at least 0.12 (docs/decisions/0042).
 _IDLE_DEVIATIONS, _MIN_RISE = 3.0, 0.08
-_MIN_IDLE, _MIN_GRIPPED = 5, 20
+MIN_IDLE, _MIN_GRIPPED = 5, 20
 # A channel that reads 0 in more of a part's frames is dead at calibration.
 _SILENT_FRACTION = 0.05
 # The least noise of a relative change, as a fraction of the median of all channels.
@@ -61,7 +61,10 @@ def fit_validator(side: str, *recordings: GripParts) -> FingertipValidator:
     scale = _noise_of_changes(noise, base)
     changes = [recording.changes(idle_frame) for recording, idle_frame in zip(recordings, bases, strict=True)]
     if not _is_separable(changes, scale):
-        raise CalibrationError(f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool?")
+        raise CalibrationError(
+            f"side {side}: gripped frames look like idle ones; did the fingertip touch the tool, and was the torque "
+            "0 until then?"
+        )
     weights = _grip_weights(changes, scale)
     step_limit = fall_limit = np.inf
     if not any(len(recording.released) for recording in recordings):
@@ -85,7 +88,7 @@ def fit_validator(side: str, *recordings: GripParts) -> FingertipValidator:
 
 def too_few_frames(n_idle: int, n_gripped: int) -> str:
     """Return why the frames before a grip and in it are too few to define a grip; empty if they are enough."""
-    if n_idle >= _MIN_IDLE and n_gripped >= _MIN_GRIPPED:
+    if n_idle >= MIN_IDLE and n_gripped >= _MIN_GRIPPED:
         return ""
     return (
         f"{n_idle} idle and {n_gripped} gripped frames are too few to detect a grip; start the recording some seconds "

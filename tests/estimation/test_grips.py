@@ -1,5 +1,7 @@
 """Recordings of several grips: each is found, and all of them are fitted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -89,3 +91,10 @@ def test_rests_between_twists_are_no_release_where_a_recording_begins_gripped(gr
 def test_a_recording_without_idle_frames_is_named():
     with pytest.raises(CalibrationError, match="recording 2 of 2: 0 idle and"):
         fit("motion_regression", [elastic(6), elastic(6, begins_gripped=True)], "rig")
+
+
+def test_a_load_cell_whose_zero_is_off_is_named_instead_of_missing_idle_frames():
+    recorded = elastic(6)
+    off = replace(recorded, torque_nm=recorded.torque_nm + 2.0 * np.abs(recorded.torque_nm).max())
+    with pytest.raises(CalibrationError, match=r"the load cell shows \+\d.* N·m from the first frame on"):
+        fit("motion_regression", [off], "rig")

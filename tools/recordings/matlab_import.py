@@ -24,6 +24,7 @@ from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import ADC_REFERENCE_V
 from shearloop.drivers.frame_clock import slope_below
+from shearloop.drivers.load_cell import STUCK_AFTER
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
@@ -529,11 +530,18 @@ def _series_of_side(side: str, stream: Stream, middles_ns: Sequence[int], load: 
 
 def _valid_load(load: Stream, remarks: list[str]) -> Stream:
     """Return the valid load values by rising time; appends to `remarks`."""
-    valid = np.abs(load.values[:, 0]) <= LARGEST_TORQUE_NM
+    torque_nm = load.values[:, 0]
+    valid = np.abs(torque_nm) <= LARGEST_TORQUE_NM
     if not valid.all():
         remarks.append(
             f"{counted(int(np.count_nonzero(~valid)), 'damaged load value')} beyond {LARGEST_TORQUE_NM:g} N·m left out."
         )
+    repeats = [len(list(run)) for _, run in itertools.groupby(torque_nm.tolist())]
+    stuck = np.repeat(np.array(repeats) >= STUCK_AFTER, repeats)
+    if stuck.any():
+        left_out = counted(int(np.count_nonzero(stuck)), "load value")
+        remarks.append(f"{left_out} left out that stood {STUCK_AFTER} times or more in a row: no load cell does that.")
+        valid &= ~stuck
     order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
     return Stream(load.unix_s[order], load.values[order])
 

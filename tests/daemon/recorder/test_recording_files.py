@@ -468,6 +468,18 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path, ran)
     assert f"  import   {imported.remarks[0]}" in ran("recording", "info", tmp_path / "a.mcap").out
 
 
+def test_values_of_a_load_cell_that_stands_still_are_left_out(mat_folder, tmp_path):
+    """A cable that broke: the last value came again and again, through the twists."""
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[100:150, 1] = load[100, 1]
+    load[200:203, 1] = load[200, 1]
+    savemat(folder / "load.mat", {"Load_Data": load})
+    imported = import_mat([folder], tmp_path / "a.mcap")
+    assert imported.torques == 355 - 50
+    assert "50 load values left out that stood 20 times or more in a row" in imported.remarks[0]
+
+
 def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
     folder = mat_folder(glitches=range(0, 353, 5))
     with pytest.raises(

@@ -24,7 +24,7 @@ import structlog
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.experiment_schema import STEP_KINDS, ExperimentFile, Mistake
 from shearloop.daemon.errors import InvalidExperimentError
-from shearloop.daemon.loaded_files import LoadedFiles
+from shearloop.daemon.loaded_files import FileStamp, LoadedFiles
 from shearloop.daemon.motion_cap import Commissioning, MotionCap
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
@@ -98,12 +98,9 @@ class ReadExperiment:
 
 
 class _Stamp(NamedTuple):
-    """What the name in the list depends on: the file's content, by its times, size and number, and the robot's cap."""
+    """What the name in the list depends on: the file's content, and the robot's cap."""
 
-    changed_ns: int
-    renamed_ns: int
-    size: int
-    number: int
+    file: FileStamp
     cap: MotionCap | None
 
 
@@ -226,9 +223,7 @@ class ExperimentFiles:
         found: dict[Path, _Stamp] = {}
         for path in self._paths():
             with suppress(OSError):
-                status = path.stat()
-                times_ns = status.st_mtime_ns, status.st_ctime_ns
-                found[path] = _Stamp(*times_ns, status.st_size, status.st_ino, cap)
+                found[path] = _Stamp(FileStamp.of(path), cap)
         return found
 
     def _name_of(self, path: Path) -> str | None:
@@ -333,7 +328,6 @@ def _run(
     on_ended: Callable[[], None],
 ) -> None:
     """Read in a thread, and give the result or the error to the event loop, if it still waits."""
-    deliver: Callable[[], None]
     try:
         deliver = partial(result.set_result, read())
     except Exception as error:  # noqa: BLE001 - it is raised in the event loop

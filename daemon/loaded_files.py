@@ -23,7 +23,7 @@ def code_of(package: Path) -> Iterator[Path]:
         yield from (package / room).resolve().rglob("*.py")
 
 
-class _Stamp(NamedTuple):
+class FileStamp(NamedTuple):
     """What the file system says of a file's content."""
 
     changed_ns: int
@@ -31,7 +31,7 @@ class _Stamp(NamedTuple):
     number: int
 
     @classmethod
-    def of(cls, path: Path) -> "_Stamp":
+    def of(cls, path: Path) -> "FileStamp":
         """Return the stamp; raises OSError."""
         status = path.stat()
         return cls(status.st_mtime_ns, status.st_size, status.st_ino)
@@ -40,7 +40,7 @@ class _Stamp(NamedTuple):
 class _Loaded(NamedTuple):
     """A file as it was read; `digest` is None of a large one."""
 
-    stamp: _Stamp
+    stamp: FileStamp
     digest: bytes | None
 
 
@@ -57,7 +57,7 @@ class LoadedFiles:
         for path in paths:
             try:
                 if path.is_file():
-                    stamp = _Stamp.of(path)
+                    stamp = FileStamp.of(path)
                     self._loaded[path] = _Loaded(stamp, _digest(path, stamp))
             except OSError:
                 continue
@@ -81,7 +81,7 @@ class LoadedFiles:
         """
         for path, loaded in self._loaded.items():
             try:
-                stamp = _Stamp.of(path)
+                stamp = FileStamp.of(path)
                 same = stamp == loaded.stamp or (loaded.digest is not None and _digest(path, stamp) == loaded.digest)
             except OSError as error:
                 return (
@@ -96,7 +96,7 @@ class LoadedFiles:
         return ""
 
 
-def _digest(path: Path, stamp: _Stamp) -> bytes | None:
+def _digest(path: Path, stamp: FileStamp) -> bytes | None:
     """Return the hash of a file's content, None of a large one; raises OSError."""
     if stamp.size > _MAX_HASHED_BYTES:
         return None

@@ -98,7 +98,8 @@ def detect_faults(
     if step is not None and step.not_following:
         found.append(Fault(FaultCode.NOT_FOLLOWING, step.not_following, t_ns=t_ns))
     if step is not None and step.overdue is not None:
-        found.append(Fault(FaultCode.STEP_OVERDUE, step.overdue))
+        slowed = inputs.arm.slowed if inputs.arm is not None else ()
+        found.append(Fault(FaultCode.STEP_OVERDUE, "; ".join((step.overdue, *slowed))))
     return found
 
 

@@ -29,6 +29,8 @@ class ArmStatus:
     enabled_by_start: bool = False
     # Why no torque of the wrench comes with it; empty where one does.
     no_torque: str = ""
+    # Why the robot turns slower than asked.
+    slowed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

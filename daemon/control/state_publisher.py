@@ -140,6 +140,8 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     latest = control_loop.inputs.torques.get(driving)
     if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s:
         latest = None
+    arm = control_loop.inputs.arm
+    slowed = arm.slowed if arm is not None else ()
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,
@@ -156,7 +158,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         stop=control_loop.safety.stop_number,
         cause=next(iter(status.decision.reasons), ""),
         faults=status.decision.codes,
-        reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
+        reasons=" ".join((*status.decision.reasons, *status.velocity.reasons, *slowed)),
         **_of_experiment(experiment),
         **_of_controller(wrist.controller),
         **_of_tool(wrist.tool),

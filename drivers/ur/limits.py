@@ -26,7 +26,7 @@ SCALING_TOLERANCE = 0.005
 
 
 def clip_wrist(asked: WristSpeed, sample: RtdeSample, settings: UrSettings) -> tuple[WristSpeed, tuple[str, ...]]:
-    """Return the wrist speed within the limits of speed, acceleration, force and range, and each reason for a change.
+    """Return the wrist speed within the limits of speed, acceleration, force and range, and what slows the motion.
 
     Near the end of the range the speed is the one that can still be braked within it: v·t + v²/2a = distance, with
     t = e·`reaction_s`. Between the inner and the hard limit of force or torque the speed falls linearly to zero.
@@ -39,7 +39,6 @@ def clip_wrist(asked: WristSpeed, sample: RtdeSample, settings: UrSettings) -> t
     braking = limits.wrist_acceleration_rad_per_s2.inner
     if asked.rad_per_s == 0 and acceleration < braking:
         acceleration = braking
-        reasons.append(f"a wrist that is to stand brakes at {braking:g} rad/s²")
     room = max(_room(asked.rad_per_s, sample, limits), 0.0)
     lag_s = _NO_OVERSHOOT * settings.reaction_s
     brakeable = braking * (math.sqrt(lag_s**2 + 2 * room / braking) - lag_s)

@@ -468,6 +468,31 @@ async def test_the_question_before_a_start_knows_where_the_wrist_is_and_does_not
     assert len(digests) == 1
 
 
+async def test_a_wrist_near_the_end_of_its_range_is_named_before_a_start(tmp_path):
+    """The robot slows it there to a stand, and the step would wait for its end for ever."""
+    config = load_daemon_config(rig(tmp_path))
+    tighten = {"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 0.3}
+    robot = Commissioning(read_settings(ROBOT), None, emulated=True)
+    files = ExperimentFiles((tmp_path,), config, torque_sources(config, {}, None), robot, LoadedFiles(()))
+    joints = robot.settings.limits.joints
+    high_rad, low_rad = joints.upper_rad[-1] - joints.margin_rad, joints.lower_rad[-1] + joints.margin_rad
+    for way, wrist_rad, is_named in (
+        ("counterclockwise", high_rad - 0.05, True),
+        ("counterclockwise", low_rad + 0.05, False),
+        ("counterclockwise", 0.0, False),
+        ("clockwise", low_rad + 0.05, True),
+        ("clockwise", high_rad - 0.05, False),
+    ):
+        path = written(tmp_path, {"do": "release"}, GRIP, {**tighten, "direction": way})
+        experiment = await files.read(path)
+        ready = Rig(new_loop())
+        ready.wrist_rad = wrist_rad
+        ready.step()
+        plan = "".join(question_of(experiment, files, ready.control_loop).plan)
+        named = re.findall(r"near the (\w+) end of its range", plan)
+        assert named == [way] * is_named, wrist_rad
+
+
 @pytest.mark.parametrize(("speed_rad_per_s", "amplitude_rad"), [(0.05, 0.2), (0.2, 0.2), (0.5, 0.1)])
 def test_the_planned_duration_of_an_identification_is_about_the_real_one(speed_rad_per_s, amplitude_rad):
     config = CONFIG.model_copy(update={"wrist_speed_rad_per_s": speed_rad_per_s})

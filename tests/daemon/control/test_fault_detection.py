@@ -371,3 +371,14 @@ def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
             compared.append(FaultCode.TORQUES_DISAGREE in {each.code for each in events})
     assert len(compared) > 150
     assert all(compared[1:])
+
+
+def test_a_step_that_is_overdue_says_what_slows_the_robot():
+    slowed = ("wrist 3 at 6.1 rad is near the end of its range",)
+    senses = LatestInputs(HEARD_S, arm=replace(FRESH_ARM, slowed=slowed))
+    (fault,) = [
+        one
+        for one in faults(senses, overdue="step 2 (tighten) has taken 61 s of at most 60 s")
+        if one.code is FaultCode.STEP_OVERDUE
+    ]
+    assert fault.detail == f"step 2 (tighten) has taken 61 s of at most 60 s; {slowed[0]}"

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
-from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, Interval, KnownTool, known_after
+from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, known_after
 from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds, first_turn_before_tare
 from shearloop.daemon.control.turns import Turn, either_way, reversals, turns, ways_between
@@ -187,14 +187,10 @@ def plan_of(
     refused_tares = _tares_before_release(file) if gripper is not None else frozenset()
     untared = first_turn_before_tare(file) if file.torque_source in (LOAD_CELL, WRENCH) else None
     planned: list[StepPlan] = []
-    tool = known
-    expected = zip(file.steps, found_turns, demands(file, speeds, known, robot), strict=True)
-    for number, (step, turn, needs) in enumerate(expected, 1):
+    needed, ends = demands(file, speeds, known, robot), _ends_of_range(file, found_turns, known, robot)
+    for number, (step, turn, needs, end) in enumerate(zip(file.steps, found_turns, needed, ends, strict=True), 1):
         waits_s = 0.0
-        notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot, speeds)]
-        if turn.turns_tool and robot is not None:
-            notes += _ends_of_range(tool, turn.reach_rad.within(file.limits_of(step).angle_rad), robot)
-        tool = known_after(step, tool, reaches=False)
+        notes = [*ways.notes(number, step, turn), *_notes(file, step, turn, robot, speeds), *end]
         if number in waits:
             notes.append(f"before it, up to {warm_up_s:.0f} s for the first torques after {waits[number]}")
             waits_s = warm_up_s
@@ -233,22 +229,27 @@ def plan_of(
     return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, assumed)
 
 
-def _ends_of_range(tool: KnownTool, reach_rad: Interval, robot: UrLimits) -> Iterator[str]:
-    """Yield the directions in which the wrist may come to the end of its range; `reach_rad` is from the grip."""
-    wrist_rad, turned_rad = tool.wrist_rad.exact, tool.angle_rad.exact
-    if wrist_rad is None or turned_rad is None:
-        return
-    gripped_at_rad, joints = wrist_rad - turned_rad, robot.joints
-    ends = (
-        ("clockwise", gripped_at_rad + reach_rad.low < joints.lower_rad[-1] + joints.margin_rad),
-        ("counterclockwise", gripped_at_rad + reach_rad.high > joints.upper_rad[-1] - joints.margin_rad),
-    )
-    for direction, comes in ends:
-        if comes:
-            yield (
-                f"the wrist may stop before its end, because wrist 3 stands near the {direction} end of its range: "
-                "turn it back first, with `turn_to` while nothing is held or with freedrive"
-            )
+def _ends_of_range(
+    file: ExperimentFile, found_turns: Sequence[Turn], start: KnownTool, robot: UrLimits | None
+) -> Iterator[list[str]]:
+    """Yield for each step notes on the ends of the wrist's range that it may come to."""
+    tool = start
+    for step, turn in zip(file.steps, found_turns, strict=True):
+        wrist_rad, turned_rad = tool.wrist_rad.exact, tool.angle_rad.exact
+        ends: list[str] = []
+        if robot is not None and turn.turns_tool and wrist_rad is not None and turned_rad is not None:
+            joints, gripped_at_rad = robot.joints, wrist_rad - turned_rad
+            reach_rad = turn.reach_rad.within(file.limits_of(step).angle_rad)
+            if gripped_at_rad + reach_rad.low < joints.lower_rad[-1] + joints.margin_rad:
+                ends.append("clockwise")
+            if gripped_at_rad + reach_rad.high > joints.upper_rad[-1] - joints.margin_rad:
+                ends.append("counterclockwise")
+        yield [
+            f"the wrist may stop before its end, because wrist 3 stands near the {end} end of its range: turn it back "
+            "first, with `turn_to` while nothing is held or with freedrive"
+            for end in ends
+        ]
+        tool = known_after(step, tool, reaches=False)
 
 
 def _waits_for_torques(file: ExperimentFile, found_turns: Sequence[Turn]) -> dict[int, str]:

@@ -283,9 +283,12 @@ def _others(written: Sequence[Path]) -> list[Path]:
 
 
 def _import(args: argparse.Namespace) -> int:
+    from shearloop.daemon.recorder.writer import PARTIAL
     from shearloop.tools.recordings.matlab_import import import_mat
 
-    check_new(args.out)
+    # A run that was killed, or still goes on, has its recording under the second name.
+    for name in (args.out.name, f"{args.out.name}{PARTIAL}"):
+        check_new(args.out.with_name(name))
     imported = import_mat(args.sources, args.out, args.time_format)
     counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
     sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."

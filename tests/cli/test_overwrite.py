@@ -56,6 +56,12 @@ def test_no_command_overwrites_a_recording(command, tmp_path, mistake):
     """It cannot be made again."""
     there = tmp_path / "precious.mcap"
     there.write_bytes(MCAP)
+    if "import" in command:
+        killed = tmp_path / "killed.mcap.partial"
+        killed.write_bytes(MCAP)
+        for out in (killed, tmp_path / "killed.mcap"):
+            assert f"{killed} exists already" in mistake(*command.split(), "--out", out)
+        assert killed.read_bytes() == MCAP
     assert f"{there} exists already" in mistake(*command.split(), "--out", there)
     assert there.read_bytes() == MCAP
 

@@ -34,8 +34,7 @@ class FrameClock:
     earlier. The board's clock is therefore the line closest below all (frame number, arrival) points. That line is the
     edge of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of
     clock skew from network delay measurements"). Its slope is the period; its height over the last few frames is the
-    phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until the real one is
-    learned.
+    phase. All times are integer nanoseconds of one monotonic clock. The nominal period applies until one is learned.
 
     A frame is late, or the board paused before it and has a new phase. A pause of more than `longest_gap` periods shows
     at once. One of more than LATE_NS shows by two frames that are later than that. A shorter one shows by EQUALLY_LATE

@@ -98,7 +98,7 @@ def detect_faults(
     if step is not None and step.not_following:
         found.append(Fault(FaultCode.NOT_FOLLOWING, step.not_following, t_ns=t_ns))
     if step is not None and step.overdue is not None:
-        slowed = inputs.arm.slowed if inputs.arm is not None else ()
+        slowed = inputs.arm.slowed_by if inputs.arm is not None else ()
         found.append(Fault(FaultCode.STEP_OVERDUE, "; ".join((step.overdue, *slowed))))
     return found
 
@@ -152,6 +152,8 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     found = [*unusable.values()]
     if step.lacks_zero:
         lost = f"{driving.name} was disconnected, or its zero was not taken, so its torques may be off by any load"
+        if why := inputs.lost.get("robot" if driving.from_robot else driving.name):
+            lost = f"{driving.name} is gone, and its zero with it: {why.removesuffix('.')}"
         found.append(Fault(FaultCode.ZERO_LOST, lost))
     if driving.name not in unusable and step.expected_nm is not None:
         found += _jump(inputs.torques.get(driving.name), step.expected_nm, watched.config.max_innovation_nm)

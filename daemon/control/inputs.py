@@ -29,8 +29,7 @@ class ArmStatus:
     enabled_by_start: bool = False
     # Why no torque of the wrench comes with it; empty where one does.
     no_torque: str = ""
-    # Why the robot turns slower than asked.
-    slowed: tuple[str, ...] = ()
+    slowed_by: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -343,7 +343,7 @@ class ControlLoopRunner:
                 late=state.late,
                 enabled_by_start=state.awaits_enable,
                 no_torque=wrench.why_unknown,
-                slowed=state.clipped,
+                slowed_by=state.clipped,
             )
         )
         if self.states.publish_robot(state, wrench) and wrench.known:

@@ -141,7 +141,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s:
         latest = None
     arm = control_loop.inputs.arm
-    slowed = arm.slowed if arm is not None else ()
+    slowed = arm.slowed_by if arm is not None else ()
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,

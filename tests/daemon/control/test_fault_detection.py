@@ -375,10 +375,21 @@ def test_each_sample_is_compared_with_a_wrench(rate_hz, slow_hz):
 
 def test_a_step_that_is_overdue_says_what_slows_the_robot():
     slowed = ("wrist 3 at 6.1 rad is near the end of its range",)
-    senses = LatestInputs(HEARD_S, arm=replace(FRESH_ARM, slowed=slowed))
+    senses = LatestInputs(HEARD_S, arm=replace(FRESH_ARM, slowed_by=slowed))
     (fault,) = [
         one
         for one in faults(senses, overdue="step 2 (tighten) has taken 61 s of at most 60 s")
         if one.code is FaultCode.STEP_OVERDUE
     ]
     assert fault.detail == f"step 2 (tighten) has taken 61 s of at most 60 s; {slowed[0]}"
+
+
+@pytest.mark.parametrize(
+    ("driving", "device", "why"),
+    [(LOAD, LOAD.name, "It is unplugged."), (WRENCH, "robot", "The connection is lost."), (WRENCH, LOAD.name, "")],
+)
+def test_a_lost_zero_names_the_loss_that_took_it(driving, device, why):
+    senses = LatestInputs(HEARD_S, arm=FRESH_ARM, lost={device: why or "Another device is unplugged."})
+    (fault,) = (one for one in faults(senses, driving=driving, lacks_zero=True) if one.code is FaultCode.ZERO_LOST)
+    gone = f"{driving.name} is gone, and its zero with it: {why.removesuffix('.')}"
+    assert fault.detail == gone if why else "or its zero was not taken" in fault.detail

@@ -71,21 +71,25 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
     before_nm = _least_squares(plain, wanted)[1]
     best: FittedCreep | None = None
     # Of the readings, not of the torque.
-    least_nm, slowest = np.inf, False
+    least_nm, best_s = np.inf, np.nan
     for time_s in _TIMES_S:
         followed = np.concatenate([_low_passed(grip, float(time_s)) for grip in grips])
         (lag, offset_nm, *gains), after_nm = _least_squares(np.column_stack([followed, plain]), wanted)
         gain = float(gains[0]) if gains else 1.0
         # Negative gain or lag is unphysical: noise that happens to fit.
         if gain > 0.0 <= lag and after_nm < least_nm:
-            least_nm = after_nm
+            least_nm, best_s = after_nm, time_s
             share = float(lag / (gain + lag))
             creep = Creep(share, float(time_s) * (1.0 - share))
             best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm / gain, after_nm / gain)
-            slowest = time_s == _TIMES_S[-1]
     if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
-    if slowest:
+    if best_s == _TIMES_S[0]:
+        raise UserError(
+            f"creep: the torque falls behind the readings by {best_s:g} s or less, and a gel creeps for longer: short "
+            "holds, or a poor calibration, look like this; hold some twists for a minute"
+        )
+    if best_s == _TIMES_S[-1]:
         raise UserError(
             "creep: the torque still fell behind the readings at the end of the recording, as it does when the "
             "estimates themselves drift; hold some twists for a minute"

@@ -70,6 +70,12 @@ def find_port(*, serial_number: str | None = None, path: str | os.PathLike[str] 
     return str(found[0])
 
 
+def _serial_number_at(path: str) -> str | None:
+    """Return the USB serial number of the board at a path, None without one."""
+    device = os.path.realpath(path)
+    return next((port.serial_number for port in list_ports.comports() if port.device == device), None)
+
+
 def _available_ports() -> str:
     ports = [
         f"{port.device} ({port.description}, serial number {port.serial_number})"
@@ -408,6 +414,17 @@ class SerialLink(Link):
     serial_number: str | None = None
     path: str | os.PathLike[str] | None = None
     baud: int = DEFAULT_BAUD
+    # The USB serial number of the first board, None while none with a number was there.
+    _first: str | None = field(default=None, init=False)
 
     async def _connect(self) -> Port:
-        return SerialPort(find_port(serial_number=self.serial_number, path=self.path), self.baud)
+        path = find_port(serial_number=self.serial_number, path=self.path)
+        number = _serial_number_at(path)
+        if self._first is not None and number not in (self._first, None):
+            raise DeviceUnavailableError(
+                f"Another board is at {path}: its USB serial number is {number}, and that of the first one was "
+                f"{self._first}. Plug each board in where it was, or restart the daemon."
+            )
+        opened = SerialPort(path, self.baud)
+        self._first = self._first or number
+        return opened

@@ -45,6 +45,23 @@ def test_a_serial_number_with_two_ports_is_not_guessed_at(monkeypatch):
         find_port(serial_number="123")
 
 
+async def test_another_board_at_a_path_is_refused(monkeypatch, tmp_path):
+    """Two fingertips that are plugged in again, each into the other's port, would be taken for each other."""
+    link = tmp_path / "eit-right"
+    with PtyPort() as right, PtyPort() as left, SerialLink(path=link) as device:
+        listed(monkeypatch, (right.path, "123"), (left.path, "456"))
+        link.symlink_to(right.path)
+        (await device.open_once()).close()
+        (await device.open_once()).close()
+        link.unlink()
+        link.symlink_to(left.path)
+        with pytest.raises(DeviceUnavailableError, match=r"serial number is 456, and that of the first one was 123"):
+            await device.open_once()
+        # A board that has no number may be the same one.
+        listed(monkeypatch)
+        (await device.open_once()).close()
+
+
 def test_a_path_without_a_port_is_said_to_be_empty(monkeypatch, tmp_path):
     listed(monkeypatch)
     with pytest.raises(DeviceNotFoundError, match=r"no serial port .*eit; no USB serial port is plugged in"):

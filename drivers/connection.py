@@ -425,6 +425,5 @@ class SerialLink(Link):
                 f"Another board is at {path}: its USB serial number is {number}, and that of the first one was "
                 f"{self._first}. Plug each board in where it was, or restart the daemon."
             )
-        opened = SerialPort(path, self.baud)
         self._first = self._first or number
-        return opened
+        return SerialPort(path, self.baud)

@@ -53,7 +53,7 @@ def _known_transport(address: str) -> str:
     address = addresses.expanded(address)
     if not addresses.has_valid_port(address):
         raise ValueError(
-            f"must end in a port, a whole number up to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
+            f"must end in a port, a whole number from 1 to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
         )
     if addresses.names_localhost(address):
         raise ValueError("names localhost, and a socket is bound to an address: write 127.0.0.1 instead of localhost")

@@ -195,8 +195,8 @@ class _Twists:
         gain = log_gain(predicted, self.truth[rows])
         if gain is None:
             raise CalibrationError(
-                "the estimates do not follow the known torque; check that the load cell and the calibration have the "
-                "same direction, and twist again"
+                "the estimates do not follow the known torque; check that the load cell's zero and direction "
+                "are right, and twist again"
             )
         of_each = float(self.own.mean()) / len(self.rows)
         explained = common + of_each + noise_nm**2 / max(float(predicted @ predicted), noise_nm**2)

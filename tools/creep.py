@@ -84,6 +84,11 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
             best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm / gain, after_nm / gain)
     if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
+    if best.after_nm >= torque.std():
+        raise UserError(
+            f"creep: the corrected readings are off by {best.after_nm * 1e3:.1f} mN·m, and the torque varies "
+            f"by {torque.std() * 1e3:.1f} mN·m alone: the calibration does not fit these recordings"
+        )
     if best_s == _TIMES_S[0]:
         raise UserError(
             f"creep: the torque falls behind the readings by {best_s:g} s or less, and a gel creeps for longer: short "

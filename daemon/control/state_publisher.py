@@ -18,10 +18,7 @@ from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.ur.messages import RobotState
 
 LOOP_STATE_PERIOD_S = 1.0
-UNTARED = (
-    "no zero of the wrench is known, because none was taken since this daemon began, or it was lost with the "
-    "connection: a step `tare` takes one"
-)
+UNTARED = "no zero of {} is known: none was taken, or the connection was lost since; a step `tare` takes one"
 # The columns of `robot.state` that are not in the robot's state under the same name, and those that are.
 _TORQUE = {"wrist_torque_nm", "wrist_torque_valid", "wrist_torque_reason"}
 _OWN = {"source", "t_mono_ns", "joints_rad", "age_s", *_TORQUE}
@@ -49,7 +46,7 @@ class StatePublisher:
         if (block := state.cycle // self.every) == self._block:
             return False
         self._block = block
-        reason = wrench.why_unknown or ("" if self.control_loop.has_zero(WRENCH) else UNTARED)
+        reason = wrench.why_unknown or ("" if self.control_loop.has_zero(WRENCH) else UNTARED.format("the wrench"))
         same: dict[str, Any] = {name: getattr(state, name) for name in _SAME}
         message = RobotStateMessage(
             source="robot",
@@ -138,10 +135,11 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     status, experiment, wrist = control_loop.status, control_loop.experiment, control_loop.wrist
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
-    if latest is not None and now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s:
+    untared = latest is not None and wrist.source.needs_zero and not control_loop.has_zero(driving)
+    if latest is not None and (untared or now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s):
         latest = None
-    arm = control_loop.inputs.arm
-    slowed = arm.slowed_by if arm is not None else ()
+    note = UNTARED.format(driving) if untared else latest.note if latest is not None else ""
+    slowed = arm.slowed_by if (arm := control_loop.inputs.arm) is not None else ()
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,
@@ -149,7 +147,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         run=control_loop.runs,
         activity=status.activity,
         torque_source=driving,
-        torque_note="; ".join(filter(None, (latest.note if latest is not None else "", control_loop.stated_tool_note))),
+        torque_note="; ".join(filter(None, (note, control_loop.stated_tool_note))),
         torque_nm=latest.torque_nm if latest is not None else None,
         speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,

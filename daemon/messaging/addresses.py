@@ -56,7 +56,7 @@ def has_valid_port(address: str) -> bool:
     port = address.rpartition(":")[2]
     if not address.startswith("tcp://") or port == "*":
         return True
-    return is_whole_number(port, len(str(LARGEST_PORT))) and int(port) <= LARGEST_PORT
+    return is_whole_number(port, len(str(LARGEST_PORT))) and 0 < int(port) <= LARGEST_PORT
 
 
 def names_localhost(address: str) -> bool:

@@ -35,7 +35,7 @@ def bind(bound: "zmq.Socket[Any]", address: str, setting: str, keys: "KeyPair | 
             keys.apply(bound)
         if not has_valid_port(address):
             raise UserError(
-                f"`{setting}: {address}` has no valid port (a whole number up to {LARGEST_PORT}); "
+                f"`{setting}: {address}` has no valid port (a whole number from 1 to {LARGEST_PORT}); "
                 "use e.g. tcp://127.0.0.1:7761"
             )
         _check_ipc_path(address, setting)

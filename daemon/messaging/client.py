@@ -327,7 +327,7 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         raise UserError(f"{address!r} is no address; it looks like {PUBLISH_ADDRESS}")
     if not has_valid_port(address):
         raise UserError(
-            f"{address} has no valid port (a whole number up to {LARGEST_PORT}); give one such as tcp://127.0.0.1:7761"
+            f"{address} has no valid port (a whole number from 1 to {LARGEST_PORT}); give one such as tcp://127.0.0.1:7761"
         )
     if keys is not None:
         keys.apply(socket)

@@ -239,8 +239,8 @@ class LoopState(Message):
     torque_source: str = column("", "source of the torque that the loop controls")
     torque_note: str = column(
         "",
-        "what that torque rests on that nothing checks, such as a tool of unknown diameter, or a stated one that does "
-        "not fit the width of an uncalibrated gripper; empty without one",
+        "why it has no zero; or what it rests on that nothing checks, such as a tool of unknown diameter, or a stated "
+        "one that does not fit the width of an uncalibrated gripper; empty without one",
     )
     torque_nm: float | None = column("N·m", "its latest value; nil if that is not valid, or stale")
     torque_limit_nm: float | None = column("N·m", "the experiment stops beyond plus or minus this torque")

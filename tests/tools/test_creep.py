@@ -87,6 +87,9 @@ def test_what_is_no_creep_is_refused():
     times, shears, torques = twisted(120.0)
     with pytest.raises(UserError, match="does not fall behind"):
         fit_creep([Stretch(times, torques, shears)])
+    noise = np.random.default_rng(3).normal(0.0, 2.0 * torques.std(), times.size)
+    with pytest.raises(UserError, match="the calibration does not fit these recordings"):
+        fit_creep([Stretch(times, shears + noise, torques)])
     with pytest.raises(UserError, match="at the end of the recording"):
         fit_creep([Stretch(times, shears, shears - 0.01 * np.cumsum(shears) / shears.size)])
 

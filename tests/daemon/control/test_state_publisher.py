@@ -103,6 +103,18 @@ async def test_a_torque_of_the_wrench_without_a_zero_is_not_valid():
         assert (states_of(cell)[-1].wrist_torque_valid, states_of(cell)[-1].wrist_torque_reason) == (True, "")
 
 
+async def test_a_driving_torque_without_a_zero_is_none():
+    """A controller that starts its program zeroes its wrench under the tool: 0.02 N·m were shown for 0.09."""
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 5.0})
+        for known in (True, False, True):
+            cell.control_loop.on_zero(WRENCH, known=known)
+            await cell.cycles(200)
+            state = [one for one in cell.published.messages if one.topic == "loop.state"][-1]
+            assert (state.torque_nm is not None) is known
+            assert ("no zero of wrench is known" in state.torque_note) is not known
+
+
 async def test_a_stop_is_logged_once_however_often_a_state_is_out_of_date():
     async with driven(cell=DoubtfulCell()) as cell:
         with capture_logs() as lines:

@@ -90,12 +90,14 @@ class ToolModel:
 class _Fit:
     """Least squares of torque = stiffness·angle + offset + drift·time (0 at the end), residuals (m,).
 
-    `equations` are their left sides, (m + 1, 3): the last one bounds the drift.
+    `equations` are their left sides, (m + 1, 3): the last one bounds the drift. Of `overlap` neighbouring torques the
+    windows overlap, so that only every such torque brings news.
     """
 
     coefficients: FloatArray
     equations: FloatArray
     residuals: FloatArray
+    overlap: int
 
     @property
     def angle_rad(self) -> FloatArray:
@@ -106,8 +108,13 @@ class _Fit:
         return float(self.residuals @ self.residuals)
 
     def covariance(self) -> FloatArray:
-        degrees = self.residuals.size - self.coefficients.size
+        degrees = self.residuals.size / self.overlap - self.coefficients.size
         return np.asarray(self.squares / degrees * np.linalg.pinv(self.equations.T @ self.equations), np.float64)
+
+    def noise_nm(self) -> float:
+        """Return the standard deviation of one torque, from differences (von Neumann 1941) without common states."""
+        differences = self.residuals[self.overlap :] - self.residuals[: -self.overlap]
+        return float(min(np.sqrt(np.mean(differences**2) / 2.0), np.sqrt(np.mean(self.residuals**2))))
 
 
 def identify(record: Record, window_s: float, stiffness_share: float = _WORST_STIFFNESS_FRACTION) -> ToolModel:
@@ -119,18 +126,20 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
     `stiffness_share`, the tool slipped, or the torque does not follow a spring.
     """
     used = np.isfinite(record.torque_nm) & (record.t_mid_s - 0.5 * window_s > record.angle_t_s[0])
-    if used.sum() < _MIN_TORQUES:
+    period_s = float(np.median(np.diff(record.t_mid_s))) if record.t_mid_s.size > 1 else math.inf
+    overlap = max(1, round(window_s / period_s))
+    if used.sum() < (needed := _MIN_TORQUES * overlap):
         raise NotYetKnownError(
-            f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {_MIN_TORQUES} are needed; "
+            f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {needed} are needed; "
             f"record for longer, and check why torques are missing"
         )
     t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
     # The wrist rests before the first motion and after the last. All lags at once, because the loop waits.
     lagged_s = (t_mid_s - _LAG_GRID_S[:, np.newaxis]).ravel()
     angles = window_means(record.angle_t_s, record.angle_rad, lagged_s, window_s).reshape(-1, t_mid_s.size)
-    fits = [_fit(angle_rad, t_mid_s, torque_nm) for angle_rad in angles]
+    fits = [_fit(angle_rad, t_mid_s, torque_nm, overlap) for angle_rad in angles]
     best = min(fits, key=lambda fit: fit.squares)
-    noise_nm = _noise(best.residuals)
+    noise_nm = best.noise_nm()
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
     lag_s, lag_std_s = _lag(fits, noise_nm)
     now, covariance = np.array([record.angle_rad[-1], 1.0, 0.0]), best.covariance()
@@ -142,14 +151,14 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
         age_s=float(np.quantile(record.t_s[used] - t_mid_s, 0.95)),
         actuation_s=_actuation(record),
         noise_nm=noise_nm,
-        sample_period_s=float(np.median(np.diff(record.t_mid_s))),
+        sample_period_s=period_s,
         angle_rad=float(record.angle_rad[-1]),
         torque_nm=float(now @ best.coefficients),
         torque_std_nm=math.sqrt(now @ covariance @ now),
     )
 
 
-def _fit(angle_rad: FloatArray, t_mid_s: FloatArray, torque_nm: FloatArray) -> _Fit:
+def _fit(angle_rad: FloatArray, t_mid_s: FloatArray, torque_nm: FloatArray, overlap: int) -> _Fit:
     since = (t_mid_s - t_mid_s[-1]) / (t_mid_s[-1] - t_mid_s[0])
     design = np.column_stack([angle_rad, np.ones_like(angle_rad), since])
     degrees = torque_nm.size - design.shape[1]
@@ -159,7 +168,7 @@ def _fit(angle_rad: FloatArray, t_mid_s: FloatArray, torque_nm: FloatArray) -> _
     drift_nm = max(_DRIFT_FRACTION * abs(float(free[0])) * float(np.ptp(angle_rad)), 1e-9)
     bounded = np.vstack([design, [0.0, 0.0, std / drift_nm]])
     coefficients = np.linalg.lstsq(bounded, np.append(torque_nm, 0.0), rcond=None)[0]
-    return _Fit(coefficients, bounded, torque_nm - design @ coefficients)
+    return _Fit(coefficients, bounded, torque_nm - design @ coefficients, overlap)
 
 
 def window_means(t_s: FloatArray, values: FloatArray, middle_s: FloatArray, window_s: float) -> FloatArray:
@@ -173,11 +182,6 @@ def window_means(t_s: FloatArray, values: FloatArray, middle_s: FloatArray, wind
 
     half_s = max(0.5 * window_s, 1e-6)
     return (until(middle_s + half_s) - until(middle_s - half_s)) / (2.0 * half_s)
-
-
-def _noise(residuals: FloatArray) -> float:
-    """Return the standard deviation of one measurement, from differences of neighbours (von Neumann 1941)."""
-    return float(min(np.sqrt(np.mean(np.diff(residuals) ** 2) / 2.0), np.sqrt(np.mean(residuals**2))))
 
 
 def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_share: float) -> None:
@@ -217,7 +221,8 @@ def _lost_at_rest(fit: _Fit, torque_nm: FloatArray, noise_nm: float) -> tuple[fl
     before, after = torque_nm[: away[0]], torque_nm[away[-1] + 1 :]
     if before.size < 2 or after.size < 2:
         return 0.0, 0.0
-    return float(before.mean() - after.mean()), noise_nm * math.sqrt(1.0 / before.size + 1.0 / after.size)
+    of_means = fit.overlap * (1.0 / before.size + 1.0 / after.size)
+    return float(before.mean() - after.mean()), noise_nm * math.sqrt(of_means)
 
 
 def _lag(fits: list[_Fit], noise_nm: float) -> tuple[float, float]:
@@ -229,7 +234,7 @@ def _lag(fits: list[_Fit], noise_nm: float) -> tuple[float, float]:
     if curve[0] <= 0.0:
         return float(_LAG_GRID_S[at]), math.inf
     offset = float(np.clip(-curve[1] / (2.0 * curve[0]), -0.04, 0.04))
-    return float(_LAG_GRID_S[at]) + offset, noise_nm / math.sqrt(float(curve[0]))
+    return float(_LAG_GRID_S[at]) + offset, noise_nm * math.sqrt(fits[at].overlap / float(curve[0]))
 
 
 def _actuation(record: Record) -> float:

@@ -78,6 +78,34 @@ def test_the_standard_deviations_are_what_repetition_shows():
     assert float(np.mean([one.noise_nm for one in found])) == pytest.approx(0.012, rel=0.06)
 
 
+def overlapping(seed: int, state_noise_nm: float = 0.07) -> Record:
+    """Return a record of the wrench: 25 means a second over 0.192 s each, of 125 noisy states a second."""
+    rate, state_s, states = 2.0 * math.pi / 7.0, 0.008, 24
+    angle_t_s = np.arange(0.0, 28.0, state_s)
+    angle_rad = 0.2 * (1.0 - np.cos(rate * angle_t_s))
+    noisy_nm = 0.25 * angle_rad + np.random.default_rng(seed).normal(0.0, state_noise_nm, angle_rad.size)
+    means_nm = np.convolve(noisy_nm, np.ones(states) / states, mode="valid")[::5]
+    t_mid_s = np.convolve(angle_t_s, np.ones(states) / states, mode="valid")[::5]
+    return Record(
+        angle_t_s=angle_t_s, angle_rad=angle_rad, sent_rad_per_s=np.zeros_like(angle_rad),
+        t_mid_s=t_mid_s, t_s=t_mid_s + 0.1, torque_nm=means_nm,
+    )  # fmt: skip
+
+
+def test_means_that_overlap_are_no_more_certain_and_no_misfit():
+    """Neighbours share most of their states: their noise seemed half as large, and the rest passed for slip or play."""
+    found = [identify(overlapping(seed), 0.192) for seed in range(40)]
+    for name, truth, std in (
+        ("stiffness_nm_per_rad", 0.25, "stiffness_std"),
+        ("lag_s", 0.0, "lag_std_s"),
+        ("torque_nm", 0.0, "torque_std_nm"),
+    ):
+        errors = np.array([getattr(one, name) - truth for one in found])
+        claimed = float(np.mean([getattr(one, std) for one in found]))
+        assert float(np.sqrt(np.mean(errors**2))) == pytest.approx(claimed, rel=0.35), name
+    assert float(np.mean([one.noise_nm for one in found])) == pytest.approx(0.07 / math.sqrt(24), rel=0.1)
+
+
 def test_a_lag_within_its_noise_counts_as_none():
     found = identify(record_of(lag_s=0.0), WINDOW_S)
     assert abs(found.lag_s) > 0.0

@@ -34,6 +34,9 @@ if TYPE_CHECKING:
 # Exports in one file, and how it begins.
 _SINGLE_FILES = {"mat": ("a MATLAB file", b"MATLAB"), "rrd": ("a file of Rerun", b"RRF")}
 
+# Metadata have no checksum of their own.
+_DAMAGED_ELSEWHERE = "Its header or metadata are damaged: a name there, of an experiment for instance, can be wrong."
+
 run = run_action
 
 
@@ -156,9 +159,22 @@ def _summary_text(found: "RecordingSummary") -> str:
         f"  {step.after_s:.1f} s after the first message: {step}; the times of the recording do not follow it."
         for step in found.clock_steps
     ]
+    lines += _damage(found)
+    if found.repaired_from is not None:
+        lost = _lost_text(found.lost_in_repair) or "nothing that its source showed"
+        lines.append(f"  It is the repaired copy of {found.repaired_from}; lost there: {lost}.")
+    if found.dropped:
+        dropped = counted(found.dropped, "message was", "messages were")
+        lines.append(f"  {dropped} dropped because the disk was too slow.")
+    return "\n".join(map(one_line, lines))
+
+
+def _damage(found: "RecordingSummary") -> list[str]:
+    """Return the lines on what is damaged or missing, and the cure."""
+    lines = []
+    repair = f"shearloop recording repair {shlex.quote(found.path)}"
     if not found.closed:
-        cure = f"`shearloop recording repair {shlex.quote(found.path)}` makes an indexed copy"
-        cure = cure if found.topics else "It holds no intact message"
+        cure = f"`{repair}` makes an indexed copy" if found.topics else "It holds no intact message"
         torn = counted(found.torn_bytes, "byte is", "bytes are")
         if found.being_written:
             lines.append("  It is being written, and its writer finishes it at the end of the run.")
@@ -170,15 +186,15 @@ def _summary_text(found: "RecordingSummary") -> str:
         lines.append(
             f"  {counted(found.damaged_attachments, 'attachment is', 'attachments are')} damaged and left out."
         )
+    if found.damaged_index:
+        lines.append("  Its index is damaged.")
+    if found.damaged_elsewhere:
+        lines.append(f"  {_DAMAGED_ELSEWHERE}")
     if found.lost:
         lines.append(f"  Lost with them: {_lost_text(found.lost)}.")
-    if found.repaired_from is not None:
-        lost = _lost_text(found.lost_in_repair) or "nothing that its source showed"
-        lines.append(f"  It is the repaired copy of {found.repaired_from}; lost there: {lost}.")
-    if found.dropped:
-        dropped = counted(found.dropped, "message was", "messages were")
-        lines.append(f"  {dropped} dropped because the disk was too slow.")
-    return "\n".join(map(one_line, lines))
+    if found.closed and found.topics and found.is_damaged:
+        lines.append(f"  `{repair}` makes a copy that the other commands read.")
+    return lines
 
 
 def _other_keys(found: "RecordingSummary") -> list[str]:
@@ -213,6 +229,10 @@ def _repair(args: argparse.Namespace) -> int:
     if not result.was_damaged and not result.being_written:
         sentences.append(f"{path} was intact: it needs no repair, and the copy has the same content.")
     sentences += [f"Lost: {_lost_text(result.lost)}."] if result.lost else []
+    if result.damaged_index:
+        sentences.append("The index was damaged: the copy has a new one.")
+    if result.damaged_elsewhere:
+        sentences.append(_DAMAGED_ELSEWHERE)
     if result.being_written:
         sentences.append(f"{path} is being written: the copy ends with the present content.")
     return print_result({**asdict(result), "path": str(result.path)}, sentences, as_json=args.json)

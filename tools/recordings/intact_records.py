@@ -1,7 +1,7 @@
 """Reads the intact part of a recording, closed or not: damage loses only the records that it hits.
 
-Chunks and attachments have a checksum. If a record's own length is damaged, reading continues at the next place that
-the index names, or at the next bytes that have the form of a chunk.
+Chunks and attachments have a checksum each, and everything before the index has one. If a record's own length is
+damaged, reading continues at the next place that the index names, or at the next bytes that have the form of a chunk.
 """
 
 import mmap
@@ -77,7 +77,8 @@ _KINDS: Mapping[int, Any] = MappingProxyType(
 )
 # The name of a chunk's compression, with its length, and its place in the record.
 _COMPRESSIONS, _COMPRESSION_AT = (b"\x04\0\0\0zstd", b"\x03\0\0\0lz4"), 37
-_SEARCHED_BYTES = 1 << 20
+_BLOCK_BYTES = 1 << 20
+_FIRST_PRIVATE_KIND = b"\x80"
 # If this number of records follow each other, they count as written by the file's writer.
 _RECORDS_IN_A_ROW = 3
 
@@ -117,6 +118,10 @@ class IntactRecords:
         self.schemas: dict[int, Schema] = {}
         self.closed = self.is_indexed = False
         self.size = self.damaged_chunks = self.damaged_attachments = self._intact_bytes = 0
+        # Whether a record of another kind cannot be read.
+        self._has_unreadable_record = False
+        # Whether the data match their common checksum, or None while that is not known.
+        self._matches_checksum: bool | None = None
         self._counts = _MessageCounts()
 
     @property
@@ -134,8 +139,19 @@ class IntactRecords:
     @property
     def is_damaged(self) -> bool:
         """Whether a part of the file, or its index, is missing or damaged."""
-        damaged = self.damaged_chunks or self.damaged_attachments or self.lost
+        damaged = self.damaged_chunks or self.damaged_attachments or self.damaged_elsewhere or self.lost
         return bool(damaged) or not self.closed or not self.is_indexed
+
+    @property
+    def damaged_index(self) -> bool:
+        """Whether the file was closed and its index is damaged."""
+        return self.closed and not self.is_indexed
+
+    @property
+    def damaged_elsewhere(self) -> bool:
+        """Whether a part is damaged that is no chunk, no attachment and no index, such as the header or metadata."""
+        unexplained = self._matches_checksum is False and not self.damaged_chunks and not self.damaged_attachments
+        return self._has_unreadable_record or unexplained
 
     @property
     def lost(self) -> dict[str, int]:
@@ -161,17 +177,25 @@ class IntactRecords:
         places = self._use_index(file)
         at, in_damaged_chunk = len(MCAP0_MAGIC), False
         self._intact_bytes = at
+        checksum = zlib.crc32(MCAP0_MAGIC)
         while not self.closed and at < self.size:
             found = self._record_at(file, at)
             if found is None:
                 next_at = self._next_place(file, at, places)
                 if next_at is None:
                     return
-                self.damaged_chunks += _was_chunk(file, at)
+                if _was_chunk(file, at):
+                    self.damaged_chunks += 1
+                elif not _is_private(file, at):
+                    self._has_unreadable_record = True
+                checksum = _checksum(file, at, next_at, checksum)
                 at, in_damaged_chunk = next_at, False
                 continue
-            record, at = found
-            self._intact_bytes = at
+            record, end = found
+            if isinstance(record, DataEnd) and record.data_section_crc:
+                self._matches_checksum = record.data_section_crc == checksum
+            checksum = _checksum(file, at, end, checksum)
+            at = self._intact_bytes = end
             self._progress(at)
             match record:
                 case Chunk():
@@ -261,14 +285,22 @@ class IntactRecords:
         begin = at + 1 + _COMPRESSION_AT
         while begin < self.size:
             file.seek(begin)
-            searched = file.read(_SEARCHED_BYTES + longest - 1)
+            searched = file.read(_BLOCK_BYTES + longest - 1)
             hits = sorted(hit for kind in _COMPRESSIONS for hit in _hits(searched, kind))
             for hit in hits:
                 place = begin + hit - _COMPRESSION_AT
                 if isinstance((self._record_at(file, place) or (None,))[0], Chunk):
                     return place
-            begin += _SEARCHED_BYTES
+            begin += _BLOCK_BYTES
         return None
+
+
+def _checksum(file: BinaryIO, begin: int, end: int, checksum: int) -> int:
+    """Continue a checksum with the bytes of a file from `begin` to `end`."""
+    file.seek(begin)
+    for at in range(begin, end, _BLOCK_BYTES):
+        checksum = zlib.crc32(file.read(min(_BLOCK_BYTES, end - at)), checksum)
+    return checksum
 
 
 def check_magic(path: Path, file: BinaryIO) -> None:
@@ -308,6 +340,12 @@ def _was_chunk(file: BinaryIO, at: int) -> bool:
     file.seek(at)
     head = file.read(_COMPRESSION_AT + max(map(len, _COMPRESSIONS)))
     return head[0] == Opcode.CHUNK or head[_COMPRESSION_AT:].startswith(_COMPRESSIONS)
+
+
+def _is_private(file: BinaryIO, at: int) -> bool:
+    """Return whether the record at `at` has a kind that MCAP leaves to other programs."""
+    file.seek(at)
+    return file.read(1) >= _FIRST_PRIVATE_KIND
 
 
 def intact_index(file: BinaryIO, size: int) -> tuple[Summary, int] | None:

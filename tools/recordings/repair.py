@@ -34,6 +34,9 @@ class RepairResult:
     torn_bytes: int
     damaged_chunks: int
     damaged_attachments: int
+    damaged_index: bool
+    # Whether a part is damaged that is no chunk, no attachment and no index, such as the header or metadata.
+    damaged_elsewhere: bool
     # Lost messages by topic, as far as the file shows them.
     lost: dict[str, int]
     # Whether a program was writing the source: the copy has the content of that moment.
@@ -72,6 +75,8 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         records.torn_bytes,
         records.damaged_chunks,
         records.damaged_attachments,
+        records.damaged_index,
+        records.damaged_elsewhere,
         records.lost,
         being_written,
         records.is_damaged,

@@ -55,6 +55,11 @@ class FileCondition:
     torn_bytes: int
     damaged_chunks: int
     damaged_attachments: int
+    damaged_index: bool
+    # Whether a part is damaged that is no chunk, no attachment and no index, such as the header or metadata.
+    damaged_elsewhere: bool
+    # Whether a part of the file, or its index, is missing or damaged.
+    is_damaged: bool
     # Lost messages by topic, as far as the file shows them.
     lost: dict[str, int]
 
@@ -126,6 +131,9 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         torn_bytes=records.torn_bytes,
         damaged_chunks=records.damaged_chunks,
         damaged_attachments=records.damaged_attachments,
+        damaged_index=records.damaged_index,
+        damaged_elsewhere=records.damaged_elsewhere,
+        is_damaged=records.is_damaged,
         lost=records.lost,
         being_written=is_being_written(path),
         dropped=dropped,

@@ -190,6 +190,55 @@ def test_a_wrong_byte_that_all_readers_would_accept_is_found_by_its_checksum(whe
         read_recording(path)
 
 
+@settings(max_examples=80, deadline=None)
+@given(where=st.floats(0, 0.9999), bit=st.integers(0, 7))
+def test_what_readers_refuse_info_calls_damaged_and_repair_mends(content, tmp_path_factory, where, bit):
+    at = int(where * len(content))
+    path = tmp_path_factory.mktemp("flipped") / "x.mcap"
+    path.write_bytes(content[:at] + bytes([content[at] ^ 1 << bit]) + content[at + 1 :])
+    try:
+        with open_recording(path):
+            refused = ""
+    except UserError as error:
+        refused = str(error)
+    assert "the recording is whole" not in refused
+    if refused.endswith(("nothing to read", "nothing can be saved")):
+        return
+    # A reader does not look at each length.
+    assert summarise(path).is_damaged or not refused
+    copy = repair(path, path.with_name("copy.mcap"))
+    assert copy.was_damaged or not refused
+    with open_recording(copy.path):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("place", "said"), [("header", "Its header or metadata are damaged"), ("index", "Its index is damaged")]
+)
+def test_info_names_damage_outside_of_the_messages(place, said, content, tmp_path, ran):
+    path = tmp_path / "x.mcap"
+    # The length of the header's first text begins after the magic bytes and the head of the record.
+    at = 8 + 9 + 3 if place == "header" else len(content) - 200
+    path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+    shown = ran("recording", "info", path).out
+    assert said in shown
+    assert f"`shearloop recording repair {path}` makes a copy" in shown
+    repaired_text = ran("recording", "repair", path).out
+    assert "needs no repair" not in repaired_text
+    assert "damaged" in repaired_text
+
+
+def test_records_of_a_kind_that_is_unknown_here_are_no_damage(tmp_path):
+    """MCAP leaves the numbers from 128 on to other programs."""
+    path = recorded(tmp_path / "x.mcap", TORQUE, enable_data_crcs=False)
+    content = path.read_bytes()
+    at = 8 + 9 + int.from_bytes(content[9:17], "little")
+    private = bytes([0x80]) + (3).to_bytes(8, "little") + b"abc"
+    cut = tmp_path / "cut.mcap.partial"
+    cut.write_bytes(content[:at] + private + content[at:-60])
+    assert not summarise(cut).damaged_elsewhere
+
+
 def test_a_check_without_a_comparison_fails(config, imported, tmp_path, ran):
     arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
     played, compared = ran("recording", "replay", imported, *arguments).err.splitlines()

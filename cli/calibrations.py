@@ -28,15 +28,15 @@ def time_range(text: str) -> tuple[float, float]:
     )
 
 
-def add_recipe(parser: argparse.ArgumentParser) -> None:
+def add_recipe(parser: argparse._ActionsContainer) -> None:
     """Add the options that say how a calibration is made, except `--bank`; `check_recipe` checks them."""
     text = "estimator to calibrate (default: %(default)s)"
     parser.add_argument("--estimator", choices=ESTIMATORS, default=DEFAULT, help=text)
     add_option(parser, "--mesh", Path, "FILE", "a mesh, which the estimator reconstruction needs")
-    add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "sides to use, e.g. right (default: all)")
-    text = "delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
+    add_option(parser, "--sides", _sides, "SIDE[,SIDE]", "for recordings: sides to use, e.g. right (default: all)")
+    text = "for recordings: delay of the load cell's timestamps, which is subtracted; 0 accepts them unchecked"
     add_option(parser, "--load-cell-delay-s", DELAY_S, "S", text)
-    text = "no torque will exceed the calibrated range: intervals do not extend beyond it"
+    text = "for slices: no torque will exceed the calibrated range, and intervals do not extend beyond it"
     parser.add_argument("--assume-full-range", action="store_true", help=text)
     text = "diameter of the tool in recordings that do not name it; on another tool there is no torque"
     add_option(parser, "--tool-mm", TOOL_MM, "MM", text)

@@ -31,7 +31,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(
         parser, "--jobs", positive(int), "N", "processes or local workers (default: 1; --cluster alone: one per core)"
     )
-    add_option(parser, "--rounds", positive(int), "N", "rounds of timing (default: 5)", default=5)
+    text = "rounds of timing of speed-accuracy (default: 5)"
+    add_option(parser, "--rounds", positive(int), "N", text, default=5)
+    parser.epilog = (
+        "speed-accuracy measures times in one thread, without --cluster and --jobs. scene chooses mesh and bank "
+        "itself, without --mesh and --bank."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -61,11 +61,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_option(parser, "recordings", Path, "REC", "recordings (.mcap) or folders of slices", nargs="*")
     text = "make a calibration without each of these in turn, and judge it there: no CAL, all are recordings"
     parser.add_argument("--leave-out", choices=("grips", "twists", "levels", "tools"), help=text)
-    text = "with --leave-out: each fit chooses its settings too, so that no choice has seen the block that judges it"
-    parser.add_argument("--nested", action="store_true", help=text)
-    text = "with --leave-out: adapt the gain to the first N twists of the judged grip, and judge the later ones"
-    add_option(parser, "--adapt-twists", number(1, 100, int), "N", text)
-    add_recipe(parser)
+    # `_refuse_recipe` refuses these without --leave-out.
+    recipe = parser.add_argument_group("only with --leave-out, which makes calibrations")
+    add_recipe(recipe)
+    text = (
+        "for recordings and the default estimator: each fit chooses its settings too, so that no choice has seen the "
+        "block that judges it"
+    )
+    recipe.add_argument("--nested", action="store_true", help=text)
+    text = "for recordings: adapt the gain to the first N twists of the judged grip, and judge the later ones"
+    add_option(recipe, "--adapt-twists", number(1, 100, int), "N", text)
     add_option(parser, "--bank", Path, "FILE", "the bank of the calibration, if any")
     text = "fraction of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)"
     add_option(parser, "--time-range", time_range, "FROM:TO", text, default="0:1")
@@ -76,8 +81,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     add_cluster(parser)
     add_json(parser)
-    parser.add_argument("--plot", action="store_true", help="draw load cell and estimate over time into --out")
-    add_option(parser, "--out", output_path, "FILE", "figure to draw (default with --plot: CAL.png)")
+    figure = parser.add_argument_group("only without --leave-out")
+    figure.add_argument("--plot", action="store_true", help="draw load cell and estimate over time into --out")
+    add_option(figure, "--out", output_path, "FILE", "figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
         "Prints each figure with its meaning, for frames with a load, for the others and for all, and why frames have "
         "no estimate. Errors and intervals are judged on frames with an estimate and a known torque or diameter."

@@ -32,7 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
     add_option(way, "--port", Path, "PATH", "the USB adapter's port, for Modbus RTU")
-    add_option(parser, "--socket-port", PORT, "PORT", "the URCap's (default: %(default)s)", default=URCAP_PORT)
+    text = "the URCap's, with --host (default: %(default)s)"
+    add_option(parser, "--socket-port", PORT, "PORT", text, default=URCAP_PORT)
     names = ", ".join(MODELS)
     text = f"{names}; as on its type plate, and as `gripper.model` in the configuration"
     parser.add_argument("--model", choices=tuple(MODELS), metavar="MODEL", required=True, help=text)

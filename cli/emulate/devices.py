@@ -72,7 +72,7 @@ def _configure_eit_kit(parser: argparse.ArgumentParser) -> None:
     frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
     add_option(frames, "--bank", Path, "FILE", "synthesise twists from this bank's signals")
     console.add_sigma(frames)
-    frames.add_argument("--once", action="store_true", help="play the recording once, then be silent")
+    frames.add_argument("--once", action="store_true", help="with --recording: play it once, then be silent")
     console.add_seed_and_speed(parser, "the board's 1.85 frames per second")
     console.add_link(parser)
 

@@ -1,5 +1,7 @@
 """`evaluate --leave-out`, and what `calibrate` says at its end, from the command line."""
 
+import re
+
 import pytest
 
 from shearloop.cli import main
@@ -130,3 +132,25 @@ def test_an_interrupted_trial_says_that_the_calibration_is_written(shared, tmp_p
 )
 def test_a_mistake_ends_in_one_sentence(arguments, said, mistake):
     assert said in mistake("evaluate", *arguments.split())
+
+
+GIVEN = {
+    "--estimator": ["paper"],
+    "--mesh": ["a.npz"],
+    "--sides": ["right"],
+    "--load-cell-delay-s": ["0"],
+    "--tool-mm": ["20"],
+    "--assume-full-range": [],
+    "--nested": [],
+    "--adapt-twists": ["1"],
+}
+
+
+def test_the_help_lists_what_needs_leave_out(mistake, capsys):
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--help"])
+    _, _, described = capsys.readouterr().out.partition("only with --leave-out")
+    group, _, _ = described.partition("\n\n")
+    assert set(re.findall(r"^ +(--[a-z-]+)", group, re.MULTILINE)) == set(GIVEN)
+    for option, values in GIVEN.items():
+        assert f"{option} is for --leave-out" in mistake("evaluate", "a.cal", "b.mcap", option, *values)

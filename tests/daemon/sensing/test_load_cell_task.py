@@ -260,15 +260,16 @@ async def test_a_load_that_comes_while_a_zero_is_taken_does_not_become_it(load_n
         assert ("was not taken: load_cell measures +0.200 N·m" in task.diagnostics()["error"]) is not taken
 
 
+@pytest.mark.parametrize("load_nm", [0.3, 0.03, 0.01])
 @pytest.mark.parametrize("confirmed", [False, True])
-async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confirmed):
+async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confirmed, load_nm):
     async with reading() as (task, board):
         board.calibration = Calibration(nm_per_raw=1.0)
         task.tare(confirmed=confirmed)
         await board.send(0.0, ZERO_SAMPLES // 2)
-        await board.send(0.3, ZERO_SAMPLES - ZERO_SAMPLES // 2)
+        await board.send(load_nm, ZERO_SAMPLES - ZERO_SAMPLES // 2)
         assert board.tares == []
-        assert "was not taken: its torque changed by 0.300 N·m during the tare" in task.diagnostics()["error"]
+        assert f"was not taken: its torque changed by {load_nm:.3f} N·m during the tare" in task.diagnostics()["error"]
         assert not task.taring
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 import socket
 import subprocess
 from collections.abc import Iterator
@@ -142,7 +143,8 @@ def _config_of_free_ports(path: Path, kept: Path | None = None) -> "DaemonConfig
 def check_ports(config: "DaemonConfig", path: Path) -> None:
     """Raise UserError if another daemon, or another program, has the sockets of the configuration in this file."""
     page = "" if is_free(HOST, PAGE_PORT) else f"http://{HOST}:{PAGE_PORT}/"
-    made = "" if path.exists() else f", which `shearloop demo --prepare --folder {path.parents[1]}` writes"
+    prepare = shlex.join(["shearloop", "demo", "--prepare", "--folder", str(path.parents[1])])
+    made = "" if path.exists() else f", which `{prepare}` writes"
     cure = f"give `publish` and `commands` other addresses in {path}{made}; --port is the page's port"
     refuse_second_daemon(config.commands, page, cure)
     ours = [urlsplit(address) for address in (config.publish, config.commands) if address.startswith("tcp://")]

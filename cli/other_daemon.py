@@ -1,5 +1,6 @@
 """A daemon that runs already at the addresses of a configuration."""
 
+import shlex
 from contextlib import suppress
 from typing import Final
 
@@ -25,11 +26,12 @@ def refuse_second_daemon(commands: str, page: str = "", cure: str = OTHER_ADDRES
     if "daemon" not in reply:
         # A desk command holds the address.
         raise UserError(str(reply.get("reason")))
+    connect = f"--connect {shlex.quote(commands)}"
     shown = f", its page is {page}" if page else ""
     raise UserError(
         f"a daemon runs already at {commands}: {whose_daemon(reply)}{shown}; "
-        f"`shearloop command stop --connect {commands}` stops its experiment, and a second time ends it. While its "
-        f"gripper holds a tool, or may hold one, open the fingers first with `shearloop command release --connect "
-        f"{commands}`, or end it with Ctrl-C in its terminal or `systemctl stop shearloop`"
+        f"`shearloop command stop {connect}` stops its experiment, and a second time ends it. While its "
+        f"gripper holds a tool, or may hold one, open the fingers first with `shearloop command release {connect}`, or "
+        f"end it with Ctrl-C in its terminal or `systemctl stop shearloop`"
         f"{f'. To run beside it, {cure}' if cure else ''}"
     )

@@ -1,6 +1,7 @@
 """A rehearsal: a configuration of real devices, with an emulated one in the place of each."""
 
 import contextlib
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -74,7 +75,7 @@ def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
     if config.experiment is not None:
         yield f"{config.experiment} starts by itself, and ends the rehearsal"
     elif settings is not None:
-        reached = f" --connect {config.commands}" if config.commands != COMMAND_ADDRESS else ""
+        reached = f" --connect {shlex.quote(config.commands)}" if config.commands != COMMAND_ADDRESS else ""
         yield f"no `experiment` is configured: start one with `shearloop command start{reached}`"
     if config.recording is not None:
         yield f"recordings go into {config.recording.folder}"

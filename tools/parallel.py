@@ -6,6 +6,7 @@ All run the same functions with the same values, so the numbers are the same.
 import asyncio
 import logging
 import os
+import shlex
 import signal
 import socket
 import sys
@@ -151,7 +152,7 @@ def open_executor(cluster: str | None, jobs: int | None = None) -> Iterator[Exec
             client.wait_for_workers(1, timeout=FIRST_WORKER_S)
         except TimeoutError as error:
             raise UserError(
-                f"the Dask scheduler at {cluster} has no worker; start some with `dask worker {cluster}`"
+                f"the Dask scheduler at {cluster} has no worker; start some with `dask worker {shlex.quote(cluster)}`"
             ) from error
         yield DaskExecutor(client)
 

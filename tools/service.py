@@ -1,5 +1,7 @@
 """Installs the daemon as a systemd service, and removes it."""
 
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -41,7 +43,18 @@ def service_file(name: str) -> str:
 
 def unit_for(program: Path) -> str:
     """Return the unit file that runs this program."""
-    return service_file(UNIT).replace(_PROGRAM, str(program))
+    return service_file(UNIT).replace(_PROGRAM, _systemd_word(str(program)))
+
+
+def _systemd_word(path: str) -> str:
+    """Return a path as one word of a systemd command line; raises UserError for a path that systemd refuses."""
+    if refused := re.search(r"[\"'\\]|[^ -~\u0080-\U0010ffff]", path):
+        raise UserError(
+            f"the program {path} has {refused[0]!r} in its path, which systemd refuses: install shearloop in a folder "
+            "with a plain name"
+        )
+    escaped = path.replace("%", "%%")
+    return f'"{escaped}"' if " " in path else escaped
 
 
 def find_program() -> Path:
@@ -105,9 +118,10 @@ def install_steps(root: Path, program: Path, *, real_time: bool, running: bool) 
         yield _program(["systemctl", "daemon-reload"], "reads the unit")
     group, check = "join the group with `sudo usermod -aG shearloop $USER`", f"run `shearloop check /{EXAMPLE}`"
     if at_root:
+        enable = shlex.join(["sudo", "systemctl", *at_root, "enable", "shearloop"])
         yield Step(
-            f"next: edit {root / EXAMPLE}, and let that system start the service with `sudo systemctl --root={root} "
-            f"enable shearloop`; once that system runs, {group}, and {check} there"
+            f"next: edit {root / EXAMPLE}, and let that system start the service with `{enable}`; once that system "
+            f"runs, {group}, and {check} there"
         )
     else:
         yield Step(f"next: {group}, edit /{EXAMPLE}, {check}, then `sudo systemctl enable --now shearloop`")
@@ -123,13 +137,26 @@ def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:
     yield _remove(root / EXAMPLE, unless_edited=service_file("shearloop.yaml").encode())
     for folder in ("keys/clients", "keys", ""):
         yield _remove(root / "etc/shearloop" / folder)
-    # The group goes with its user; a missing user is no failure.
-    prefix = [] if root == Path("/") else ["--prefix", str(root)]
-    yield _program(["userdel", *prefix, "shearloop"], "removes the user and its group", may_fail=True)
+    # The group goes with its user.
+    if _has_user(root):
+        prefix = [] if root == Path("/") else ["--prefix", str(root)]
+        yield _program(["userdel", *prefix, "shearloop"], "removes the user and its group", may_fail=True)
+    else:
+        yield Step("not there: the user shearloop")
     if running:
         yield _program(["systemctl", "daemon-reload"], "forgets the unit")
         yield _program(["udevadm", "control", "--reload"], "forgets the rules")
-    yield Step(f"left alone: {root / 'var/lib/shearloop'}, with your banks, calibrations and recordings")
+    if (work := root / "var/lib/shearloop").exists():
+        yield Step(f"left alone: {work}, with your banks, calibrations and recordings")
+
+
+def _has_user(root: Path) -> bool:
+    """Return whether the system below `root` has a user `shearloop`."""
+    try:
+        users = (root / "etc/passwd").read_text(encoding="utf-8", errors="replace")
+    except FileNotFoundError:
+        return False
+    return any(line.startswith("shearloop:") for line in users.splitlines())
 
 
 def _remove_real_time(root: Path) -> Iterator[Step]:
@@ -179,6 +206,6 @@ def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> S
         done = subprocess.run(command, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
         if done.returncode != 0 and not may_fail:
             output = " ".join((done.stderr or done.stdout).split())
-            raise UserError(f"`{' '.join(arguments)}` failed with status {done.returncode}: {output}")
+            raise UserError(f"`{shlex.join(arguments)}` failed with status {done.returncode}: {output}")
 
-    return Step(f"run `{' '.join(arguments)}`, which {purpose}", run)
+    return Step(f"run `{shlex.join(arguments)}`, which {purpose}", run)

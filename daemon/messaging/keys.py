@@ -5,6 +5,7 @@ folder of the allowed clients' `.key` files is read again for each new connectio
 """
 
 import os
+import shlex
 import stat
 import struct
 from collections.abc import Iterator
@@ -73,8 +74,9 @@ def load_key_pair(path: Path) -> KeyPair:
         raise UserError(f"{path} holds no secret key; give the file that ends in .key_secret")
     if path.stat().st_mode & stat.S_IROTH:
         raise UserError(
-            f"{path}: every user of this machine can read the secret key: run `chmod 600 {path}`, and make a new pair "
-            f"if another user may have read it; {_WHO_MAKES_KEYS}"
+            f"{path}: every user of this machine can read the secret key: run "
+            f"`chmod 600 {shlex.quote(str(path))}`, and make a new pair if another user may have read it; "
+            f"{_WHO_MAKES_KEYS}"
         )
     if zmq.curve_public(secret) != public:
         raise UserError(f"{path}: its public and its secret key do not match; {_WHO_MAKES_KEYS}")

@@ -26,8 +26,9 @@ def test_a_taken_port_is_named_before_anything_is_built(monkeypatch):
         port = other.getsockname()[1]
         config = CONFIG.model_copy(update={"publish": f"tcp://127.0.0.1:{port}", "commands": "ipc:///tmp/nobody"})
         with pytest.raises(UserError, match=f"127.0.0.1:{port} is taken by another program") as refused:
-            demo.check_ports(config, Path("my/config/demo.yaml"))
-    assert "in my/config/demo.yaml, which `shearloop demo --prepare --folder my` writes; --port" in str(refused.value)
+            demo.check_ports(config, Path("my rig/config/demo.yaml"))
+    prepare = "shearloop demo --prepare --folder 'my rig'"
+    assert f"in my rig/config/demo.yaml, which `{prepare}` writes; --port" in str(refused.value)
     demo.check_ports(config, Path("my/config/demo.yaml"))
 
 

@@ -33,6 +33,12 @@ def answering(monkeypatch, reply):
     monkeypatch.setattr(other_daemon, "send_to_stop_socket", lambda *_: reply)
 
 
+def test_the_address_in_a_command_can_be_copied(monkeypatch):
+    answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
+    with pytest.raises(UserError, match="`shearloop command stop --connect 'ipc:///tmp/my rig/commands'`"):
+        other_daemon.refuse_second_daemon("ipc:///tmp/my rig/commands")
+
+
 def test_a_second_demo_is_refused_by_name(monkeypatch):
     answering(monkeypatch, {"ok": True, "tasks": {}, "daemon": RUNNING})
     first = r"or may hold one, open the fingers first with `shearloop command release --connect"

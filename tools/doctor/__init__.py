@@ -316,7 +316,7 @@ def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     mode = path.stat().st_mode & 0o777
     if mode & 0o077:
         means = "a reader of this key can pose as the daemon"
-        cure = f"`chmod 600 {path}`; make new keys if another user may have read it"
+        cure = f"`chmod 600 {shlex.quote(str(path))}`; make new keys if another user may have read it"
         return trouble("keys", f"others can read {path} (mode {mode:o})", means, cure)
     if clients.unusable:
         means = "its client cannot connect; the others can"

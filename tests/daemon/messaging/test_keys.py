@@ -275,9 +275,9 @@ def test_a_file_that_is_no_key_locks_out_nobody(keys, ran, result_of):
 
 
 def test_a_secret_key_that_every_user_can_read_is_named(keys):
-    secret = keys / "keys" / "server.key_secret"
+    secret = (keys / "keys").rename(keys / "my keys") / "server.key_secret"
     secret.chmod(0o644)
-    with pytest.raises(UserError, match=r"every user of this machine can read the secret key: run `chmod 600"):
+    with pytest.raises(UserError, match=r"every user of this machine can read the secret key: run `chmod 600 '"):
         load_key_pair(secret)
     secret.chmod(0o600)
-    assert load_key_pair(secret).public == load_public_key(keys / "keys" / "server.key")
+    assert load_key_pair(secret).public == load_public_key(keys / "my keys" / "server.key")

@@ -87,9 +87,27 @@ def test_dry_run_prints_the_steps_and_changes_nothing(command, tmp_path, place):
     kept.write_text("something else")
     said = place(command, "--dry-run")
     assert f"would {'replace' if command == 'install' else 'remove'} {kept}" in said
-    assert "would run `" in said
+    assert command == "uninstall" or "would run `" in said
     assert files(tmp_path) == {PLACES["shearloop.service"]}
     assert kept.read_text() == "something else"
+
+
+def test_nothing_is_removed_where_nothing_was_installed(place):
+    steps = json.loads(place("uninstall", "--json"))["steps"]
+    assert not any(step["acts"] for step in steps)
+    assert all(step["says"].startswith("not there: ") for step in steps)
+
+
+def test_commands_of_the_steps_can_be_copied(tmp_path, ran):
+    root = tmp_path / "an image"
+    (root / "etc").mkdir(parents=True)
+    (root / "etc/passwd").write_text("shearloop:x:998:998::/:/usr/sbin/nologin\n")
+    (root / "program").touch()
+    removed = ran("uninstall", "--root", root, "--dry-run").out
+    assert f"would run `userdel --prefix '{root}' shearloop`" in removed
+    made = ran("install", "--root", root, "--program", "/program", "--dry-run").out
+    assert f"`systemd-sysusers '--root={root}' shearloop.conf`" in made
+    assert f"`sudo systemctl '--root={root}' enable shearloop`" in made
 
 
 def test_the_steps_as_json(tmp_path, place):

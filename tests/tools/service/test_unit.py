@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
+from shearloop.errors import UserError
 from shearloop.tools.service import PLACES, UNIT, hidden_folder, service_file, unit_for
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,6 +43,25 @@ def test_the_unit_runs_the_program_given(unit):
 def test_systemd_accepts_the_unit(unit):
     done = analyze("verify", str(unit))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("name", ["a b", "100%n", "a$b", "a;b", "ü", "-a  b"])
+def test_systemd_accepts_the_path_of_the_program(name, tmp_path):
+    folder = tmp_path / name
+    folder.mkdir()
+    program = folder / "shearloop"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    path = tmp_path / UNIT
+    path.write_text(unit_for(program))
+    done = analyze("verify", str(path))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+@pytest.mark.parametrize("sign", ["'", '"', "\\", "\n"])
+def test_a_sign_that_systemd_refuses_is_named(sign):
+    with pytest.raises(UserError, match=re.escape(f"has {sign!r} in its path, which systemd refuses")):
+        unit_for(Path(f"/opt/a{sign}b/shearloop"))
 
 
 def test_systemd_reports_a_wrong_unit(tmp_path):

@@ -7,7 +7,8 @@ from tempfile import TemporaryFile
 
 from shearloop.cli.options import add_cluster, add_option, number, positive
 from shearloop.cli.output_paths import output_path
-from shearloop.errors import UserError, require
+from shearloop.cli.plots import require_matplotlib
+from shearloop.errors import UserError
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
@@ -42,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Draw one chart and print its paths."""
     _check_arguments(args)
-    require("matplotlib", "plot", "a chart")
+    require_matplotlib("a chart")
     from shearloop.tools.drawing import writing_charts
     from shearloop.tools.outputs import new_folder
 

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from shearloop.cli.calibrations import add_recipe, check_recipe, of_slices, time_range
 from shearloop.cli.options import add_cluster, add_json, add_option, number
 from shearloop.cli.output_paths import output_path
+from shearloop.cli.plots import require_matplotlib
 from shearloop.cli.terminal import print_result, table
-from shearloop.errors import UserError, missing
+from shearloop.errors import UserError
 from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator_names import DEFAULT
 from shearloop.tools.outputs import writing
@@ -144,6 +145,7 @@ def _checked_figure(args: argparse.Namespace) -> Path | None:
         return None
     from shearloop.tools.outputs import check_apart, check_overwrite
 
+    require_matplotlib("the figure")
     figure: Path = args.out or args.calibration.with_suffix(".png")
     if figure.suffix not in _FIGURES:
         raise UserError(f"--out {figure} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
@@ -285,11 +287,8 @@ def _draw(found: "Evaluation", out: Path) -> None:
     names = [
         f"{path.name}, {' and '.join(track.series.sides)}" for path, track in zip(found.paths, tracks, strict=True)
     ]
-    try:
-        with writing(out, "the figure"):
-            draw_tracks(tracks, names, found.title, out, found.draw)
-    except ModuleNotFoundError as error:
-        raise missing(error.name, "plot", "the figure") from error
+    with writing(out, "the figure"):
+        draw_tracks(tracks, names, found.title, out, found.draw)
     print(f"The figure is in {out}.", file=sys.stderr)
 
 

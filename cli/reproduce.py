@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.options import PAPERS_RECORDINGS, add_json, add_option, positive
 from shearloop.cli.output_paths import output_path
-from shearloop.errors import missing
+from shearloop.cli.plots import require_matplotlib
 from shearloop.tools.outputs import progress_bar, writing
 from shearloop.tools.parallel import processors
 
@@ -31,11 +31,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Compute the numbers, then write, print and draw them."""
-    try:
-        from shearloop.studies.reproduce.report import draw_all
-    except ModuleNotFoundError as error:
-        raise missing(error.name, "plot", "a figure") from error
-    from shearloop.studies.reproduce.report import json_text, table
+    # Before anything is computed.
+    require_matplotlib("a figure")
+    from shearloop.studies.reproduce.report import draw_all, json_text, table
 
     found = _reproduce(args, args.jobs or processors())
     numbers = args.out / "reproduce.json"

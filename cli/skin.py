@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_action, add_json, add_option, number, run_action
 from shearloop.cli.output_paths import output_path
+from shearloop.cli.plots import require_matplotlib
 from shearloop.cli.terminal import print_result, table
-from shearloop.errors import UserError, require
+from shearloop.errors import UserError
 from shearloop.tools.outputs import YAML_KEYS, check_overwrite, new_folder, writing
 
 if TYPE_CHECKING:
@@ -45,7 +46,7 @@ def _characterise(args: argparse.Namespace) -> int:
 
     if args.out is not None:
         # First, to report a missing library or folder at once.
-        require("matplotlib", "plot", "a figure")
+        require_matplotlib("a figure")
         from shearloop.studies.charts.skin_figures import draw
 
     with ExitStack() as folder:

@@ -216,10 +216,12 @@ class Recorder:
         # The error of the present flush. `failure` keeps the last one's meanwhile: a disk that stays full stays known.
         self._failing = ""
         self.closed_files: list[Path] = []
+        self._new_folders = [one for one in (folder, *folder.parents) if not one.exists()]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._current = self._new_file(lost_before=0)
         except OSError as error:
+            self._remove_new_folders()
             # `mkdir` only says of such a link that a file exists.
             lost = folder.is_symlink() and not folder.exists()
             why = f"it is a link to {folder.readlink()}, which does not exist" if lost else error.strerror
@@ -309,6 +311,15 @@ class Recorder:
                 self._current.closed = True
                 self._finish_file(self._current, self._counts.dropped + self._counts.unwritable)
                 self.failure = self._failing
+                if not self.closed_files:
+                    self._remove_new_folders()
+
+    def _remove_new_folders(self) -> None:
+        """Remove the folders that this recorder made and that are empty: a refused run leaves nothing."""
+        for folder in self._new_folders:
+            # One that is not empty stays.
+            with suppress(OSError):
+                folder.rmdir()
 
     @property
     def _waiting_bytes(self) -> int:

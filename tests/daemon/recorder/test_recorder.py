@@ -166,8 +166,24 @@ def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path, monkeypatc
     assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.closed_files] == [[0, 1], [2]]
 
 
-def test_a_daemon_without_a_message_leaves_no_file(tmp_path):
+def test_a_daemon_without_a_message_leaves_no_file_and_no_folder_of_its_own(tmp_path):
     Recorder(tmp_path, IDENTITY, Clock()).close()
+    assert list(tmp_path.iterdir()) == []
+    Recorder(tmp_path / "recordings/emulated", IDENTITY, Clock()).close()
+    assert list(tmp_path.iterdir()) == []
+    refused = Recorder(tmp_path / "recordings/emulated", IDENTITY, Clock())
+    (tmp_path / "recordings/notes.txt").touch()
+    refused.close()
+    assert list(tmp_path.rglob("*")) == [tmp_path / "recordings", tmp_path / "recordings/notes.txt"]
+
+
+def test_a_recorder_that_cannot_begin_leaves_no_folder(tmp_path, monkeypatch):
+    def full(*_arguments: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(McapFile, "flush", full)
+    with pytest.raises(UserError, match="cannot record there: No space left on device"):
+        Recorder(tmp_path / "recordings/emulated", IDENTITY, Clock())
     assert list(tmp_path.iterdir()) == []
 
 

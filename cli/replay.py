@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.clock import Clock
     from shearloop.daemon.config import DaemonConfig
     from shearloop.daemon.messaging.publisher import Publisher
-    from shearloop.tools.recordings.replay import RecordedRun, ReplayComparison
+    from shearloop.tools.recordings.replay import RecordedRun, ReplayComparison, ReplayPace
 
 
 # A free port: a comparison needs no subscriber, and a daemon may have the usual address.
@@ -51,11 +51,17 @@ def run(args: argparse.Namespace) -> int:
 
     run = RecordedRun(args.recording)
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
-        comparison = asyncio.run(_replay(run, config, args))
+        comparison, pace = asyncio.run(_replay(run, config, args))
     same_code = run.metadata.get("code_sha256") == code_digest()
     made_by = "" if same_code else run.metadata.get("software", "of an unknown version")
     if not args.check:
         print(f"{run.path}: replayed {counted(sum(run.counts.values()), 'recorded message')}.", file=sys.stderr)
+    if pace.is_behind:
+        print(
+            f"The replay was {pace.reached:.3g} times as fast as the recording, not {pace.asked:g} times: this "
+            "computer was too slow or too busy; choose a lower --speed.",
+            file=sys.stderr,
+        )
     for line in (*_other_keys_text(run, made_by), *_comparison_text(comparison, made_by)):
         print(line, file=sys.stderr)
     if args.json:
@@ -85,7 +91,9 @@ def _speed(text: str) -> float:
     raise argparse.ArgumentTypeError(f"{text} is not a number above 0, or max")
 
 
-async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace) -> "ReplayComparison":
+async def _replay(
+    run: "RecordedRun", config: "DaemonConfig", args: argparse.Namespace
+) -> "tuple[ReplayComparison, ReplayPace]":
     import zmq.asyncio
 
     from shearloop.cli.terminal import print_estimate, shown_topics
@@ -102,10 +110,10 @@ async def _replay(run: "RecordedRun", config: "DaemonConfig", args: argparse.Nam
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, sum(run.counts.values()), "message"))
-        await replay.play(args.speed, progress)
+        pace = await replay.play(args.speed, progress)
         # The last messages are still being sent.
         await asyncio.sleep(0.1)
-    return replay.comparison
+    return replay.comparison, pace
 
 
 def _publisher(context: "zmq.asyncio.Context", args: argparse.Namespace, clock: "Clock") -> "Publisher":

@@ -57,6 +57,8 @@ COMPUTED_TOPICS = tuple(kind.topic for kind in _COMPUTED)
 # These depend on the computer, not on the measurement.
 NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
 _MAX_EXAMPLES = 5
+# A replay is clearly slower than asked if it takes longer by this time and by this factor.
+_LATE_S, _SLOWER = 0.5, 1.1
 # What tells the messages of a source apart, the first that they have; other code may move a time by less than this.
 _PLACES = (("frame", 0), ("sample", 0), ("t_mono_ns", 5_000_000))
 # The keys that a replay needs of each raw input and of each message, and the further ones by topic.
@@ -363,6 +365,26 @@ class ReplayComparison:
             self.examples.append(f"{event.topic} of {event.source}, number {event.content['seq']}: {text}")
 
 
+@dataclass(frozen=True, slots=True)
+class ReplayPace:
+    """How fast events were replayed: the asked factor, the time that they took as they happened, and in the replay."""
+
+    asked: float
+    recorded_s: float
+    took_s: float
+
+    @property
+    def reached(self) -> float | None:
+        """How many times as fast as they happened the events were replayed, None for no time at all."""
+        return self.recorded_s / self.took_s if self.took_s > 0 and self.recorded_s > 0 else None
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether the replay was clearly slower than asked; `max` asks for no factor."""
+        late_s = self.took_s - self.recorded_s / self.asked
+        return self.asked < math.inf and late_s > _LATE_S and self.took_s > _SLOWER * self.recorded_s / self.asked
+
+
 class Replay:
     """The parsers and estimators of one configuration, fed with a recording; `clock` is the publisher's clock."""
 
@@ -407,14 +429,15 @@ class Replay:
         load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
         return {*self._sessions, *load_cell, *((SKIN,) if self._skin is not None else ())}
 
-    async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
+    async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> ReplayPace:
         """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
         loop = asyncio.get_running_loop()
-        began_s, first_ns = loop.time(), None
+        began_s, first_ns, last_ns = loop.time(), None, 0
         for number, event in enumerate(self._run.events(), 1):
             # The time of a message lies before its sending. Only a raw input has its arrival time.
             if event.raw is not None or not self._run.has_inputs:
                 first_ns = event.t_mono_ns if first_ns is None else first_ns
+                last_ns = event.t_mono_ns
                 due_s = began_s + (event.t_mono_ns - first_ns) / 1e9 / speed
                 if due_s > loop.time():
                     await asyncio.sleep(due_s - loop.time())
@@ -427,6 +450,8 @@ class Replay:
         if self._load_parser is not None:
             dropped.append(self._load_parser.dropped_at_opening)
         self.comparison.dropped_at_opening = sum(dropped)
+        recorded_ns = 0 if first_ns is None else last_ns - first_ns
+        return ReplayPace(speed, recorded_ns / 1e9, loop.time() - began_s)
 
     async def _process(self, event: RecordedEvent) -> None:
         if event.topic == schema.CLOCK_TOPIC:

@@ -204,6 +204,7 @@ def test_a_replay_prints_each_count_and_each_difference_under_its_name(source, c
         "left_out": {"loop.state": [FURTHER]},
         "differing": {"load.torque": {"torque_nm": "in mN·m, not in N·m"}},
         "left_out_topics": ["hand.posture"],
+        "lost_in_repair": {},
     }
 
 

@@ -35,7 +35,14 @@ from shearloop.estimation import Calibration, Measured, Session
 from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.tools.recordings.matlab_import import import_mat
 from shearloop.tools.recordings.message_content import read_content
-from shearloop.tools.recordings.replay import RecordedEvent, RecordedRun, Replay, ReplayClock, ReplayComparison
+from shearloop.tools.recordings.replay import (
+    RecordedEvent,
+    RecordedRun,
+    Replay,
+    ReplayClock,
+    ReplayComparison,
+    ReplayPace,
+)
 from tests.daemon.recorder.test_recorder import frame as one_frame
 from tests.fixtures.daemons import ask, emulated_kit, played_at, recording, running_daemon
 from tests.sample_messages import sample
@@ -152,6 +159,23 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, ran: Callabl
     assert len(zeros) == 2, "the operator's tare is replayed"
     errors = ran("recording", "replay", path, "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check").err
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in errors
+
+
+@pytest.mark.parametrize(
+    ("asked", "took_s", "behind"),
+    [(20.0, 5.0, False), (20.0, 5.4, False), (20.0, 6.0, True), (1.0, 100.6, False), (math.inf, 50.0, False)],
+)
+def test_a_replay_that_is_clearly_slower_than_asked_is_behind(asked, took_s, behind):
+    pace = ReplayPace(asked, 100.0, took_s)
+    assert (pace.is_behind, pace.reached) == (behind, 100.0 / took_s)
+
+
+def test_a_replay_that_is_slower_than_asked_says_how_fast_it_was(imported, config, monkeypatch, tmp_path, ran):
+    monkeypatch.setattr("shearloop.tools.recordings.replay._LATE_S", 0.0)
+    arguments = ["recording", "replay", imported, "--config", str(config()), "--publish", f"ipc://{tmp_path}/replay"]
+    said = ran(*arguments, "--speed", "1e9").err
+    assert re.search(r"^The replay was [\d.e+]+ times as fast as the recording, not 1e\+09 times: ", said, re.MULTILINE)
+    assert "times as fast" not in ran(*arguments, "--speed", "max").err
 
 
 @pytest.mark.long

@@ -237,6 +237,8 @@ class Design:
     """
 
     relative_noise: float
+    # Of all frames, or None where it is not known.
+    largest_torque_nm: float | None
     models: tuple[ModelFit, ...]
     model: str
     k_range: tuple[float, float]
@@ -274,6 +276,7 @@ def design_bank(fingertip: Fingertip, measured: MeasuredFrames) -> Design:
     channels, injections = _board_choices(measured, table)
     return Design(
         relative_noise=noise,
+        largest_torque_nm=None if measured.torque_nm is None else float(np.abs(measured.torque_nm).max()),
         models=models,
         model=model,
         k_range=k_range,

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.design import ALLOWED, Design, MeasuredFrames, design_bank
 from shearloop.errors import UserError
+from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.series import FrameSeries
 from shearloop.estimation.validator_fit import channel_noise
@@ -21,6 +22,7 @@ _N_DIRECTIONS = 4
 _MAX_UNEXPLAINED = 0.71
 # Twice the noise of the recorded slices (16 %; recorded twists 8 and 12 %); without a grip it is 47 %.
 _MAX_NOISE = 1.0 / 3.0
+_RECORD_A_TWIST = "record a tool that is gripped and twisted"
 
 
 def designed_for(scene: MeasuredFrames, fingertip: Path | None) -> tuple[Path, Design]:
@@ -94,15 +96,19 @@ def doubts(design: Design) -> list[str]:
     """Return reasons not to build a bank of this design, in sentences; empty for frames of a grip."""
     found = []
     least = min(fit.penalised for fit in design.models)
+    is_twisted = design.largest_torque_nm is not None and design.largest_torque_nm >= LOADED_NM
+    elsewhere = "design for another side, or use an estimator without a bank"
     if least > _MAX_UNEXPLAINED:
+        cure = f"the twisted tool changes this fingertip in another way than the models: check --fingertip, {elsewhere}"
         found.append(
             f"even the best model leaves {least:.1%} of a frame unexplained, against 61% of the paper's slices: "
-            "a bank explains less than half of such a frame; record a tool that is gripped and twisted"
+            f"a bank explains less than half of such a frame; {cure if is_twisted else _RECORD_A_TWIST}"
         )
     if design.relative_noise > _MAX_NOISE:
+        cure = f"the twisted tool hardly changes this fingertip: grip more firmly, {elsewhere}"
         found.append(
             f"the noise is {design.relative_noise:.1%} of a difference frame, against 16% of the paper's samples: "
-            "it hides the signal; record a tool that is gripped and twisted"
+            f"it hides the signal; {cure if is_twisted else _RECORD_A_TWIST}"
         )
     return found
 

@@ -71,6 +71,20 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path):
     assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.definition.k_grid)[0]
 
 
+@pytest.mark.parametrize(("torque_nm", "is_twisted"), [(0.01, True), (1e-4, False)])
+def test_a_twist_is_not_asked_for_where_the_tool_is_twisted(torque_nm, is_twisted, tmp_path, ran):
+    rng = np.random.default_rng(0)
+    frames = step_frames()[:, rng.permutation(PAPER_TABLE.n_channels)]
+    frames += rng.normal(0.0, 5e-3, frames.shape)
+    for number, frame in enumerate(frames, 1):
+        savemat(
+            tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": torque_nm * number / 8}
+        )
+    said = ran("bank", "design", tmp_path).err
+    assert said.count("record a tool that is gripped and twisted") == (0 if is_twisted else 2)
+    assert said.count("the twisted tool") == (2 if is_twisted else 0)
+
+
 @pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
 def test_frames_that_no_model_explains_are_called_so_on_screen_and_in_the_configuration(
     noise_v, mixed_up, tmp_path, ran

@@ -159,7 +159,7 @@ def test_doubts_about_a_design_are_printed_with_its_chart(monkeypatch, tmp_path,
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
     # One design per recording, with the attributes that the doubts need; no other is looked at.
     found = iter(
-        SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
+        SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise, largest_torque_nm=None)
         for penalised, noise in ((0.6, 0.16), (0.9, 0.5))
     )
     monkeypatch.setattr(scene, "design_bank", lambda *_: next(found, None))

@@ -120,7 +120,7 @@ def either(one: str, other: str) -> Any:
 
     def check(section: Model) -> Model:
         if (getattr(section, one) is None) == (getattr(section, other) is None):
-            raise ValueError(f"give either {one} or {other}, and not both")
+            raise ValueError(f"give either {one} or {other}, with a value, and not both")
         return section
 
     return model_validator(mode="after")(check)

@@ -66,7 +66,7 @@ class BankConfig(ConfigModel):
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
         if (self.mesh is None) == (self.fingertip is None):
-            raise ValueError("give either `mesh` (with a `file`) or `fingertip`, and not both")
+            raise ValueError("give either `mesh` (with a `file`) or `fingertip`, with a value, and not both")
         if self.mesh_size_cm is not None and self.fingertip is None:
             raise ValueError("`mesh_size_cm` is for a `fingertip`; a `mesh` that is read from a file has its own")
         if self.sigma.low <= 0 and MODELS[self.model].uses_sigma:

@@ -169,7 +169,7 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "
     if kind in ("value_error", "assertion_error"):
         return details["msg"].split(", ", 1)[1]
     here = _schema_at(schema, location, schema)
-    choices, allowed = list(map(str, here.get("enum", ()))), _allowed(here)
+    choices, allowed = list(map(str, here.get("enum", ()))), _allowed_length(details) or _allowed(here)
     if kind.startswith("union_tag"):
         choices = [tag.strip("'") for tag in details["ctx"].get("expected_tags", "").split(", ") if tag]
         found, allowed = details["ctx"].get("tag"), ", ".join(choices)
@@ -232,6 +232,20 @@ def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: M
             or next(iter(schema.get("patternProperties", {}).values()), None)
         )
     return _schema_at(inside, rest, root) if isinstance(inside, Mapping) else {}
+
+
+def _allowed_length(details: ErrorDetails) -> str:
+    """Return the lengths that a text or a list of a wrong length may have, else an empty text."""
+    limits = details.get("ctx", {})
+    match details["type"]:
+        case "string_too_long":
+            return f"up to {counted(limits['max_length'], 'character')}"
+        case "too_long":
+            return f"up to {counted(limits['max_length'], 'entry', 'entries')}"
+        case "too_short":
+            return f"{counted(limits['min_length'], 'entry', 'entries')} or more"
+        case _:
+            return ""
 
 
 def _allowed(schema: Mapping[str, Any]) -> str:

@@ -376,3 +376,18 @@ def test_a_name_that_no_file_has_is_refused_in_short(name):
     with pytest.raises(UserError, match="no experiment has such a name") as refused:
         read_yaml(Path(name), UserError, "experiment")
     assert len(str(refused.value)) < 100
+
+
+def test_a_wrong_length_names_the_limit(tmp_path):
+    steps = "steps: [{do: tare}]\n"
+    assert "is too long; allowed: up to 80 characters" in refused(
+        tmp_path, f"name: {200 * 'ä'}\n{steps}", ExperimentFile
+    )
+    assert "is too long; allowed: up to 60 characters" in refused(tmp_path, f"name: {200 * 'ä'}\n", DaemonConfig)
+    few = refused(tmp_path, "name: one\nsteps: []\n", ExperimentFile)
+    assert "steps: [] has too few entries; allowed: 1 entry or more" in few
+
+
+def test_an_empty_value_counts_as_none_of_two_keys(tmp_path):
+    said = refused(tmp_path, "load_cell: {device: {serial_number: }}\n", DaemonConfig)
+    assert "load_cell.device: give either serial_number or path, with a value, and not both" in said

@@ -266,8 +266,8 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
     ("content", "sentence"),
     [
         ({}, "nothing is measured: give `fingertips`, a `skin` or a `load_cell`"),
-        ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, and not both"),
-        ({"skin": section({})}, "skin.daq: give either scanner or adc, and not both"),
+        ({"skin": section({**ADC, **SCANNER})}, "skin.daq: give either scanner or adc, with a value, and not both"),
+        ({"skin": section({})}, "skin.daq: give either scanner or adc, with a value, and not both"),
         ({"skin": section(ADC, source={})}, "skin.source: give either socket or serial"),
         ({"skin": section(ADC, source={"serial": {}})}, "skin.source.serial: give either serial_number or path"),
         ({"skin": section(ADC, source={"socket": {"host": "a"}})}, "skin.source.socket.port: is missing"),

@@ -1,7 +1,7 @@
 """The clock of a board that sends a frame each period, from the arrivals of its frames. No I/O."""
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Collection
 from itertools import islice, pairwise
 from statistics import median
 
@@ -43,9 +43,9 @@ class FrameClock:
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
         self._longest_gap = longest_gap
-        # The period, and how many frames it is learned from: 0 for the nominal one.
+        # The period, how many frames it is learned from (0 for the nominal one), and how many were taken since then.
         self.period_ns = nominal_period_ns
-        self.learned_from = 0
+        self.learned_from = self._taken_since = 0
         self._exact_period_ns = float(nominal_period_ns)
         # The number of the last frame, and how many frames up to it waited for their reader.
         self._number = self._waited_in_a_row = 0
@@ -124,6 +124,7 @@ class FrameClock:
 
     def _take(self, arrival_ns: int) -> None:
         """Take a frame that shows the board's phase and period."""
+        self._taken_since += 1
         self._seen.append((self._number, arrival_ns))
         self._latest.append((self._number, arrival_ns))
         if len(self._latest) > SPACING_FRAMES:
@@ -132,29 +133,27 @@ class FrameClock:
         self._learn()
 
     def _learn(self) -> None:
-        if len(self._spacings) < LEARN_FROM:
-            return
-        spacing = median(self._spacings)
-        if spacing <= 0:
+        spacing = median(self._spacings) if len(self._spacings) == LEARN_FROM else 0.0
+        if spacing <= 0.0:
             return
         # A burst of late frames has other spacings before and after it.
         middle = sorted(self._spacings)[LEARN_FROM // 4 : -LEARN_FROM // 4]
         steady = max(abs(one - spacing) for one in middle) <= STEADY * spacing
         # A late frame makes spacings wrong, too.
         plausible_ns = max(PLAUSIBLE * spacing, LATE_NS / SPACING_FRAMES)
-        if steady and abs(self._exact_period_ns - spacing) > plausible_ns:
-            self._exact_period_ns, self.learned_from = spacing, LEARN_FROM
+        # A wrong period can make the board seem to pause again and again, and no slope confirms it.
+        if steady and (self._taken_since > PERIOD_WINDOW or abs(self._exact_period_ns - spacing) > plausible_ns):
+            self._exact_period_ns, self.learned_from, self._taken_since = spacing, LEARN_FROM, 0
         # Late frames make the slope of a few wrong, as after a restart: it is no better than that of more before it.
         if len(self._seen) >= max(LEARN_FROM, self.learned_from):
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
-                self._exact_period_ns, self.learned_from = slope, len(self._seen)
+                self._exact_period_ns, self.learned_from, self._taken_since = slope, len(self._seen), 0
         self.period_ns = round(self._exact_period_ns)
 
 
-def slope_below(points: Iterable[tuple[int, int]]) -> float:
+def slope_below(points: Collection[tuple[int, int]]) -> float:
     """Return the slope of the line closest below all points, which are in order of their abscissa."""
-    points = list(points)
     hull: list[tuple[int, int]] = []
     for n, t in points:
         while len(hull) > 1 and not _is_below_chord(hull[-1], hull[-2], (n, t)):

@@ -218,6 +218,18 @@ def test_another_speed_after_a_restart_is_learned():
     assert abs(error[30:]).max() < 100_000
 
 
+@pytest.mark.parametrize("ratio", [0.9, 1.02, 1.03, 1.05, 1.1, 1.2])
+def test_a_slightly_slower_or_faster_board_after_a_restart_is_learned(ratio):
+    """With the period of before, the slower board seems to pause again and again."""
+    clock = FrameClock(PERIOD_NS)
+    straightened(sent(100), clock)
+    clock.restart()
+    truth = 100_000_000_000 + round(ratio * PERIOD_NS) * np.arange(200)
+    error = straightened(truth + np.random.default_rng(0).integers(0, 4_000_000, 200), clock) - truth
+    assert clock.period_ns == pytest.approx(ratio * PERIOD_NS, rel=1e-3)
+    assert abs(error[150:]).max() < 4_000_000
+
+
 @given(st.lists(st.integers(0, 5_000_000_000), min_size=1, max_size=120))
 def test_whatever_comes_a_stamp_is_never_after_the_arrival_and_never_before_the_board_could(gaps):
     clock = FrameClock(PERIOD_NS)

@@ -138,7 +138,8 @@ def _update(run: Run, content: Mapping[str, Any]) -> None:
     if content["response"] == "hold" and run.last["response"] != "hold":
         run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
     run.last = content
-    run.torque_note = content.get("torque_note") or run.torque_note
+    if content.get("torque_nm") is not None:
+        run.torque_note = content.get("torque_note") or run.torque_note
     if run.steps:
         run.steps[-1].to_ns = now_ns
     if content["phase"] in _ENDS:

@@ -215,8 +215,8 @@ class OperatorView:
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"
         tare = "a `release` and a `tare`" if self.tool.may_hold() else "a `tare`"
         return (
-            f"no zero of the {driving.name} is known, because none was taken since this daemon began, or it was lost "
-            "with the connection. Its torques and limits may be off by any load: "
+            f"no zero of the {driving.name} is known: none was taken since this daemon began, the last tare failed, or "
+            "the connection was lost. Its torques and limits may be off by any load: "
             f"put {tare} before step {number} ({file.steps[number - 1].do}){command}"
         )
 

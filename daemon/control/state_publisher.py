@@ -18,7 +18,7 @@ from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.ur.messages import RobotState
 
 LOOP_STATE_PERIOD_S = 1.0
-UNTARED = "no zero of {} is known: none was taken, or the connection was lost since; a step `tare` takes one"
+UNTARED = "no zero of {} is known: none was taken, the last tare failed, or the link was lost; a step `tare` takes one"
 # The columns of `robot.state` that are not in the robot's state under the same name, and those that are.
 _TORQUE = {"wrist_torque_nm", "wrist_torque_valid", "wrist_torque_reason"}
 _OWN = {"source", "t_mono_ns", "joints_rad", "age_s", *_TORQUE}

@@ -30,6 +30,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "hold": 0,
         "activity": "",
         "set_point_nm": 0.1,
+        "torque_nm": 0.1,
         "stiffness_nm_per_rad": 0.75,
         "delay_s": 0.8,
         "noise_nm": 0.012,
@@ -163,6 +164,9 @@ def test_what_the_torque_rests_on_is_said_once():
     states = [loop_state(0), loop_state(1, torque_note=note), loop_state(2, torque_note=note)]
     assert summary_of(*states, loop_state(3, phase="done", torque_note="")).count(note) == 1
     assert note not in summary_of(loop_state(0), loop_state(3, phase="done"))
+    # Before its tare, a run has no torque, and the note says why.
+    untared = loop_state(0, torque_nm=None, torque_note="no zero is known")
+    assert "no zero" not in summary_of(untared, loop_state(1, torque_note=""), loop_state(3, phase="done"))
 
 
 def test_holds_are_counted_by_their_kind():

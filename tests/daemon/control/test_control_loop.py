@@ -812,7 +812,10 @@ def test_no_torque_without_a_zero_turns_a_tool():
         return said
 
     for steps in ([GRIP, twist], [GRIP, {"do": "identify"}, hold]):
-        assert "no zero of the load_cell is known, because none was taken since this daemon began" in refusal(*steps)
+        assert (
+            "no zero of the load_cell is known: none was taken since this daemon began, the last tare failed"
+            in refusal(*steps)
+        )
         assert "put a `tare` before step 2" in refusal(*steps)
         assert refusal({"do": "tare"}, *steps) == ""
         assert refusal(*steps, source="right") == ""

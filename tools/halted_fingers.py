@@ -19,6 +19,8 @@ async def halted_if_interrupted(gripper: RobotiqGripper) -> AsyncIterator[None]:
             await _halt(gripper)
         except DriverError as error:
             print(f"The fingers may still move: they could not be halted. {error}", file=sys.stderr, flush=True)
+        except (asyncio.CancelledError, KeyboardInterrupt):
+            print("The fingers may still move: a second interrupt ended their halt.", file=sys.stderr, flush=True)
         raise
 
 

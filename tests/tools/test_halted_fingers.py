@@ -39,3 +39,24 @@ async def test_fingers_that_cannot_be_halted_are_told(way, tmp_path, capsys):
             async with halted_if_interrupted(rig.driver):
                 raise asyncio.CancelledError
     assert "may still move" in capsys.readouterr().err
+
+
+async def test_a_halt_that_a_second_interrupt_ends_is_told(tmp_path, capsys, monkeypatch):
+    async with a_rig("socket", tmp_path, active=True, reply_deadline_s=2.0) as rig:
+        halting = asyncio.Event()
+
+        async def halt_that_waits() -> None:
+            halting.set()
+            await asyncio.Event().wait()
+
+        async def interrupted() -> None:
+            async with halted_if_interrupted(rig.driver):
+                raise asyncio.CancelledError
+
+        monkeypatch.setattr(rig.driver, "halt", halt_that_waits)
+        motion = asyncio.create_task(interrupted())
+        await halting.wait()
+        motion.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await motion
+    assert "may still move: a second interrupt ended their halt" in capsys.readouterr().err

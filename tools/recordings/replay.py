@@ -329,7 +329,7 @@ class ReplayComparison:
         """
         waiting = self.waiting.get((event.topic, event.source), deque())
         self.compared[event.topic] += 1
-        key, tolerance = next(one for one in _PLACES if one[0] in event.content)
+        key, tolerance = next(one for one in _PLACES if event.content.get(one[0]) is not None)
         place = event.content[key]
         while waiting and waiting[0][key] < place - tolerance:
             waiting.popleft()

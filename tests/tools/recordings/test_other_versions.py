@@ -203,6 +203,7 @@ def test_a_replay_prints_each_count_and_each_difference_under_its_name(source, c
         "not_recorded": {"health": ["instance"]},
         "left_out": {"loop.state": [FURTHER]},
         "differing": {"load.torque": {"torque_nm": "in mN·m, not in N·m"}},
+        "lost_in_repair": {},
         "left_out_topics": ["hand.posture"],
         "lost_in_repair": {},
     }
@@ -236,12 +237,13 @@ def test_a_replay_says_in_one_sentence_which_key_it_needs(topic, key, source, tm
         RecordedRun(one.path)
 
 
-def test_a_comparison_leaves_out_a_key_that_was_not_recorded(source, tmp_path):
-    one = other(source, tmp_path / "x.mcap", {"load.torque": "raw"}, ["load.torque"])
-    (event, *_) = (event for event in RecordedRun(one.path).events() if event.topic == "load.torque")
+@pytest.mark.parametrize(("topic", "key"), [("load.torque", "raw"), ("eit.estimate", "frame")])
+def test_a_comparison_leaves_out_a_key_that_was_not_recorded(topic, key, source, tmp_path):
+    one = other(source, tmp_path / "x.mcap", {topic: key}, [topic])
+    (event, *_) = (event for event in RecordedRun(one.path).events() if event.topic == topic)
     for changes, differences in (({}, 0), ({"torque_nm": 9.0}, 1)):
-        comparison = ReplayComparison({"load.torque"})
-        comparison.add_computed("load.torque", {**event.content, "raw": 7.0, **changes})
+        comparison = ReplayComparison({schema.recorded_topic(topic, event.source)})
+        comparison.add_computed(topic, {**event.content, key: 7, **changes})
         comparison.compare(event)
         assert (comparison.compared.total(), comparison.different.total()) == (1, differences)
 

@@ -205,7 +205,6 @@ def test_a_replay_prints_each_count_and_each_difference_under_its_name(source, c
         "differing": {"load.torque": {"torque_nm": "in mN·m, not in N·m"}},
         "lost_in_repair": {},
         "left_out_topics": ["hand.posture"],
-        "lost_in_repair": {},
     }
 
 

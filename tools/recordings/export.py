@@ -1,8 +1,9 @@
 """Exports topics of a recording as tables: CSV or Parquet, a file per topic, or MATLAB, all topics in a file."""
 
+import csv
 import io
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -12,8 +13,8 @@ from pydantic_core import to_json
 from scipy.io import savemat
 
 from shearloop.errors import UserError, require
-from shearloop.files import replace_file
-from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
+from shearloop.files import refusing_damage, replace_file
+from shearloop.tools.outputs import LentFile, check_apart, check_link, check_overwrite, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import columns_of_topics, read_messages
 from shearloop.tools.recordings.recorded_columns import UNITS_TABLE, TopicColumns
@@ -26,7 +27,8 @@ _BATCH = 200_000
 _MAT_SIZE, _KEY_SIZE = 12_000_000, 10
 # MATLAB takes 63 characters.
 _LONGEST_NAME = 59
-# The variable of a MATLAB file, and the table next to the CSV files, with the units of all columns.
+# The first line of the table next to the CSV files, with the units of all columns.
+_UNITS_HEAD = "topic,column,unit"
 # A cell with one of these stands in quotes.
 _QUOTED = re.compile(r'[",\r\n]')
 
@@ -113,6 +115,8 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     for target in (paths | units).values():
         check_link("--out", target)
         check_apart("--out", target, [(f"the recording {path}", path)])
+    for target in units.values():
+        check_overwrite(target, "the units of exported tables", _UNITS_HEAD.encode())
     columns = columns_of_topics(path, topics)
     tables: dict[str, _CsvTable | _ParquetTable] = {}
     with new_folder(out), ExitStack() as files:
@@ -130,11 +134,25 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
             table.close()
         if form == "csv":
             rows = [(topic, *unit) for topic in tables for unit in columns[topic].units.items()]
-            lines = [",".join(map(_csv_cell, row)) for row in (("topic", "column", "unit"), *rows)]
+            rows += _units_of_others(units[UNITS_TABLE], tables)
+            lines = [_UNITS_HEAD, *(",".join(map(_csv_cell, row)) for row in rows)]
             files.enter_context(replace_file(units[UNITS_TABLE])).write(
                 "".join(f"{line}\r\n" for line in lines).encode()
             )
     return list((paths | units).values())
+
+
+def _units_of_others(path: Path, written: Collection[str]) -> list[tuple[str, str, str]]:
+    """Return the present rows of a table of units for tables beside it that an export did not write."""
+    if not path.exists():
+        return []
+    damage = "the table of units cannot be read: {}; remove it, or choose another --out"
+    with (
+        refusing_damage(path, UserError, "the table of units", damage),
+        path.open(encoding="utf-8", newline="") as file,
+    ):
+        rows = [(row["topic"], row["column"], row["unit"]) for row in csv.DictReader(file)]
+    return [row for row in rows if row[0] not in written and (path.parent / f"{row[0]}.csv").exists()]
 
 
 class _CsvTable:

@@ -56,6 +56,33 @@ def check_table_units(path: Path, out: Path, expected: Units, ran: Callable[...,
         assert read.units(topic) == units
 
 
+def test_tables_of_an_earlier_export_keep_their_units(tmp_path, ran):
+    one = made(tmp_path).path
+    ran("recording", "export", one, "--out", tmp_path / "x")
+    whole = csv_units(tmp_path / "x/units.csv")
+    gone, other, last = list(whole)[:3]
+    (tmp_path / f"x/{gone}.csv").unlink()
+    ran("recording", "export", one, "--topic", other, "--out", tmp_path / "x")
+    assert csv_units(tmp_path / "x/units.csv") == {topic: units for topic, units in whole.items() if topic != gone}
+    ran("recording", "export", one, "--topic", last, "--topic", gone, "--out", tmp_path / "x")
+    assert csv_units(tmp_path / "x/units.csv") == whole
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"my own notes\n", "units.csv exists and is not the units"),
+        (b"topic,column,unit\n\xff", "units cannot be read"),
+    ],
+)
+def test_another_table_of_units_is_refused_and_stays(content, said, tmp_path, mistake):
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x/units.csv").write_bytes(content)
+    assert said in mistake("recording", "export", made(tmp_path).path, "--out", tmp_path / "x")
+    assert (tmp_path / "x/units.csv").read_bytes() == content
+    assert [path.name for path in (tmp_path / "x").iterdir()] == ["units.csv"]
+
+
 def test_each_way_out_has_the_messages_units(tmp_path, ran):
     one = made(tmp_path)
     expected = declared(one.columns())

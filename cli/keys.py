@@ -3,6 +3,7 @@
 import argparse
 import re
 import shlex
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -52,10 +53,18 @@ def _server(args: argparse.Namespace) -> int:
         f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
         f"next: `{_allow_command(folder)}` for each client's .key, then add to the configuration:",
-        f"curve: {{server_key: {secret}, clients: {clients}}}",
+        f"curve: {_in_braces({'server_key': str(secret), 'clients': str(clients)})}",
     ]
     content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
     return print_result(content, sentences, as_json=args.json)
+
+
+def _in_braces(section: dict[str, str]) -> str:
+    """Return a section of a configuration in one line, with quotes where a text needs them."""
+    import yaml
+
+    text = yaml.safe_dump(section, default_flow_style=True, sort_keys=False, width=sys.maxsize, allow_unicode=True)
+    return text.strip()
 
 
 def _client(args: argparse.Namespace) -> int:

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+import yaml
 import zmq
 import zmq.asyncio
 
@@ -224,6 +225,14 @@ def test_the_paths_of_keys_are_whole(ran, tmp_path, monkeypatch):
     said = ran("keys", "client", "--dir", "mine").out
     assert "add `--dir` with their folder" in said
     assert f"server.key back to {tmp_path}/mine/server.key" in said
+
+
+def test_the_printed_section_of_a_configuration_can_be_copied(tmp_path, ran):
+    folder = tmp_path / "my rig, its keys: {one}"
+    folder.mkdir()
+    (line,) = (one for one in ran("keys", "server", "--dir", folder).out.splitlines() if one.startswith("curve: "))
+    server, clients = str(folder / "server.key_secret"), str(folder / "clients")
+    assert yaml.safe_load(line) == {"curve": {"server_key": server, "clients": clients}}
 
 
 def test_a_damaged_key_is_an_error(keys):

@@ -34,8 +34,11 @@ if TYPE_CHECKING:
 # Exports in one file, and how it begins.
 _SINGLE_FILES = {"mat": ("a MATLAB file", b"MATLAB"), "rrd": ("a file of Rerun", b"RRF")}
 
-# Metadata have no checksum of their own.
-_DAMAGED_ELSEWHERE = "Its header or metadata are damaged: a name there, of an experiment for instance, can be wrong."
+# Only the whole file has a checksum of them.
+_DAMAGED_ELSEWHERE = (
+    "A part outside of its messages is damaged, such as its header or metadata: a name there, of an experiment for "
+    "instance, can be wrong."
+)
 
 run = run_action
 

@@ -210,6 +210,11 @@ class IntactRecords:
                     self.closed = True
                 case None:
                     self.damaged_attachments += 1
+                # What a chunk says of them has a checksum. A damaged index repeats them.
+                case Schema():
+                    self.schemas.setdefault(record.id, record)
+                case Channel():
+                    self.channels.setdefault(record.id, record)
                 case _:
                     yield from self._usable(record)
 

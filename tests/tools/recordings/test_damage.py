@@ -212,8 +212,20 @@ def test_what_readers_refuse_info_calls_damaged_and_repair_mends(content, tmp_pa
         pass
 
 
+def test_a_damaged_index_changes_no_channel_and_no_identity(content, tmp_path):
+    """The index repeats each channel with the recording's identity."""
+    index = int.from_bytes(content[-28:-20], "little")
+    for repeated in (b"load.torque", basic_identity("a test")["channel_table_hash"].encode()):
+        at = content.index(repeated, index)
+        path = tmp_path / f"{at}.mcap"
+        path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
+        copy = repair(path, tmp_path / f"{at}.copy.mcap")
+        with open_recording(copy.path) as recording:
+            assert "load.torque" in recording.counts
+
+
 @pytest.mark.parametrize(
-    ("place", "said"), [("header", "Its header or metadata are damaged"), ("index", "Its index is damaged")]
+    ("place", "said"), [("header", "A part outside of its messages is damaged"), ("index", "Its index is damaged")]
 )
 def test_info_names_damage_outside_of_the_messages(place, said, content, tmp_path, ran):
     path = tmp_path / "x.mcap"

@@ -21,7 +21,7 @@ from shearloop.daemon.recorder.schema import (
     SIDES,
 )
 from shearloop.daemon.recorder.writer import new_recording
-from shearloop.drivers.defaults import FRAME_PERIOD_S
+from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
 from shearloop.drivers.eit_kit import ADC_REFERENCE_V
 from shearloop.drivers.frame_clock import slope_below
 from shearloop.drivers.load_cell import STUCK_AFTER
@@ -536,11 +536,15 @@ def _valid_load(load: Stream, remarks: list[str]) -> Stream:
         remarks.append(
             f"{counted(int(np.count_nonzero(~valid)), 'damaged load value')} beyond {LARGEST_TORQUE_NM:g} N·m left out."
         )
+    # A stream that is faster than the cell repeats each of its values. The daemon counts alike.
+    period_s = float(np.median(np.diff(np.sort(load.unix_s)))) if len(load.unix_s) > 1 else 0.0
+    in_time = round(STUCK_AFTER / (period_s * LOAD_CELL_RATE_HZ)) if period_s > 0.0 else 0
+    stuck_after = max(STUCK_AFTER, in_time)
     repeats = [len(list(run)) for _, run in itertools.groupby(torque_nm.tolist())]
-    stuck = np.repeat(np.array(repeats) >= STUCK_AFTER, repeats)
+    stuck = np.repeat(np.array(repeats) >= stuck_after, repeats)
     if stuck.any():
         left_out = counted(int(np.count_nonzero(stuck)), "load value")
-        remarks.append(f"{left_out} left out that stood {STUCK_AFTER} times or more in a row: no load cell does that.")
+        remarks.append(f"{left_out} left out that stood {stuck_after} times or more in a row: no load cell does that.")
         valid &= ~stuck
     order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
     return Stream(load.unix_s[order], load.values[order])

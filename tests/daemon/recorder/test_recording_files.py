@@ -480,6 +480,18 @@ def test_values_of_a_load_cell_that_stands_still_are_left_out(mat_folder, tmp_pa
     assert "50 load values left out that stood 20 times or more in a row" in imported.remarks[0]
 
 
+def test_a_load_that_is_written_faster_than_its_cell_measures_is_kept(mat_folder, tmp_path):
+    folder, repeats = mat_folder(), 15
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    # The cell itself may measure the same twice.
+    load[101::2, 1] = load[100:-1:2, 1]
+    repeated = np.repeat(load, repeats, axis=0)
+    repeated[:, 0] = np.interp(np.arange(len(repeated)), repeats * np.arange(len(load)), load[:, 0])
+    kept = repeated[: repeats * (len(load) - 1)]
+    savemat(folder / "load.mat", {"Load_Data": kept})
+    assert import_mat([folder], tmp_path / "a.mcap").torques == len(kept)
+
+
 def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
     folder = mat_folder(glitches=range(0, 353, 5))
     with pytest.raises(

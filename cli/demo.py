@@ -24,7 +24,8 @@ from shearloop.cli.temporary_folders import run_folder
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.messaging.addresses import stop_name
 from shearloop.daemon.process import number_of
-from shearloop.errors import UserError, missing
+from shearloop.errors import UserError
+from shearloop.extras import missing
 from shearloop.tools.outputs import writing
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 import logging
 
-from shearloop.errors import require
+from shearloop.extras import require
 
 
 def require_matplotlib(what: str) -> None:

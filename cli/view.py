@@ -10,7 +10,8 @@ from shearloop.cli.options import PORT, add_fingertip, add_option, load_fingerti
 from shearloop.cli.output_paths import output_path
 from shearloop.cli.terminal import print_result
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys
-from shearloop.errors import UserError, require
+from shearloop.errors import UserError
+from shearloop.extras import require
 
 if TYPE_CHECKING:
     from shearloop.daemon.messaging.keys import ClientKeys

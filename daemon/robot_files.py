@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import os
 import re
+import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,7 +92,8 @@ def _lock(path: Path, what: str, commands: str, opened: contextlib.ExitStack) ->
         except BlockingIOError:
             file.seek(0)
             process, _, address = file.read().partition(" ")
-            stop = f"with `shearloop command stop --connect {address}`" if address else "with Ctrl-C in its terminal"
+            command = f"shearloop command stop --connect {shlex.quote(address)}"
+            stop = f"with `{command}`" if address else "with Ctrl-C in its terminal"
             raise UserError(
                 f"the {what} is driven by another program of this computer (process {process}): "
                 f"stop that one first, {stop}, or name another {what.split(maxsplit=1)[0]} in the configuration"

@@ -18,7 +18,8 @@ from functools import partial
 from multiprocessing import active_children, get_context
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from shearloop.errors import UserError, missing
+from shearloop.errors import UserError
+from shearloop.extras import missing
 from shearloop.tools.interrupts import interrupts_held
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import numpy as np
 
 from shearloop.daemon.messaging.messages import TOPICS
 from shearloop.daemon.recorder import schema
-from shearloop.errors import UserError, require
+from shearloop.errors import UserError
+from shearloop.extras import require
 
 
 class FoxgloveServer(AbstractContextManager["FoxgloveServer", None]):

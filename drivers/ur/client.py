@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import math
 import platform
+import shlex
 import signal
 import sys
 import time
@@ -46,7 +47,7 @@ _SECOND_NS = 10**9
 
 def missing_library() -> str:
     """Return why the robot cannot be driven with this Python, or an empty string."""
-    pip = f"{sys.executable} -m pip install"
+    pip = f"{shlex.quote(sys.executable)} -m pip install"
     if find_spec("rtde_control") is None:
         return (
             f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "

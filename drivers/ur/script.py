@@ -9,6 +9,7 @@ is slower than these stops, because a program that ends while the arm moves may 
 
 import hashlib
 import math
+import shlex
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
@@ -126,7 +127,7 @@ def why_other_client() -> str:
         return ""
     return (
         f"the installed ur-rtde is of version {found}, and the script for the robot speaks only the protocol of "
-        f"{CLIENT_VERSION}: install it with `{sys.executable} -m pip install ur-rtde=={CLIENT_VERSION}`"
+        f"{CLIENT_VERSION}: install it with `{shlex.quote(sys.executable)} -m pip install ur-rtde=={CLIENT_VERSION}`"
     )
 
 

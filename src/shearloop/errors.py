@@ -1,7 +1,5 @@
 """Mistakes that end a command with one sentence and exit status 2."""
 
-import sys
-from importlib.util import find_spec
 from typing import NamedTuple
 
 
@@ -28,17 +26,6 @@ class Hint(NamedTuple):
 
 class ActionError(Exception):
     """An action of the devices that cannot be carried out; the message says why, and what to do."""
-
-
-def require(module: str, extra: str, what: str) -> None:
-    """Raise UserError if a module is not installed that `what` needs, and that `extra` of shearloop brings."""
-    if find_spec(module) is None:
-        raise missing(module, extra, what)
-
-
-def missing(module: str | None, extra: str, what: str) -> UserError:
-    """Return the error of a module that is not installed, with the command that installs it for this Python."""
-    return UserError(f"{what} needs {module}: `{sys.executable} -m pip install 'shearloop[{extra}]'`")
 
 
 class NotBegunError(ActionError):

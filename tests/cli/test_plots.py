@@ -14,7 +14,7 @@ def test_a_home_that_cannot_be_written_is_not_remarked_on(tmp_path):
 
 
 def test_matplotlib_is_missed_before_anything_is_computed(tmp_path, monkeypatch, mistake):
-    monkeypatch.setattr("shearloop.errors.find_spec", lambda _: None)
+    monkeypatch.setattr("shearloop.extras.find_spec", lambda _: None)
     (tmp_path / "a.cal").touch()
     out = str(tmp_path / "out")
     for command in (

@@ -77,6 +77,13 @@ def test_the_file_is_in_systemds_state_folder_or_the_users(tmp_path, monkeypatch
     assert memory_path("a/../b") == Path("/var/lib/shearloop/robot-a_.._b.json")
 
 
+def test_the_command_that_stops_the_other_daemon_can_be_copied():
+    files = RobotFiles("192.168.1.10")
+    stop = "with `shearloop command stop --connect 'ipc:///tmp/my rig/commands'`"
+    with lock_robot(files, "ipc:///tmp/my rig/commands"), pytest.raises(UserError, match=stop), lock_robot(files):
+        pytest.fail("it has the robot as well")
+
+
 def test_one_daemon_at_a_time_drives_a_robot():
     files = RobotFiles("192.168.1.10")
     with lock_robot(files, "tcp://127.0.0.1:27762"):

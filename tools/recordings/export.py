@@ -12,7 +12,8 @@ import numpy as np
 from pydantic_core import to_json
 from scipy.io import savemat
 
-from shearloop.errors import UserError, require
+from shearloop.errors import UserError
+from shearloop.extras import require
 from shearloop.files import refusing_damage, replace_file
 from shearloop.tools.outputs import LentFile, check_apart, check_link, check_overwrite, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress

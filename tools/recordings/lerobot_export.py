@@ -24,7 +24,8 @@ from shearloop.daemon.messaging.messages import (
     SkinShear,
 )
 from shearloop.daemon.recorder import schema
-from shearloop.errors import UserError, require
+from shearloop.errors import UserError
+from shearloop.extras import require
 from shearloop.files import replace_file
 from shearloop.tools.outputs import LentFile, check_apart, check_link, lent_file, new_folder
 from shearloop.tools.recordings.intact_records import Progress

@@ -15,7 +15,7 @@ from shearloop.bank.fingertip import Fingertip
 from shearloop.daemon.messaging.messages import ENVELOPE, EitEstimate, EitHeatmap, RobotStateMessage
 from shearloop.daemon.recorder import schema
 from shearloop.daemon.web.message_store import conductivity_profile
-from shearloop.errors import require
+from shearloop.extras import require
 from shearloop.files import replace_file
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import columns_of_topics, read_messages

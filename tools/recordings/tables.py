@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.errors import missing
+from shearloop.extras import missing
 from shearloop.tools.recordings.intact_records import Progress
 from shearloop.tools.recordings.reader import columns_of_topics, open_recording, read_messages
 

@@ -196,7 +196,7 @@ def test_absent_topics_are_left_out_of_a_dataset_and_none_is_refused(tmp_path, r
 @pytest.mark.parametrize(("form", "extra"), [("rrd", "rerun"), ("lerobot", "export"), ("parquet", "export")])
 def test_a_missing_extra_is_named(form, extra, tmp_path, mistake, monkeypatch):
     recording = write(tmp_path / "a.mcap", ("eit.frame",))
-    monkeypatch.setattr("shearloop.errors.find_spec", lambda _: None)
+    monkeypatch.setattr("shearloop.extras.find_spec", lambda _: None)
     assert f"pip install 'shearloop[{extra}]'" in mistake("recording", "export", recording, "--format", form)
     assert "pip install 'shearloop[foxglove]'" in mistake("view", "--foxglove", "0")
 

@@ -98,9 +98,10 @@ class ReadExperiment:
 
 
 class _Stamp(NamedTuple):
-    """What the name in the list depends on: the file's content, and the robot's cap."""
+    """What the name in the list depends on: the file's content, its rights, and the robot's cap."""
 
     file: FileStamp
+    rights_changed_ns: int
     cap: MotionCap | None
 
 
@@ -223,7 +224,7 @@ class ExperimentFiles:
         found: dict[Path, _Stamp] = {}
         for path in self._paths():
             with suppress(OSError):
-                found[path] = _Stamp(FileStamp.of(path), cap)
+                found[path] = _Stamp(FileStamp.of(path), path.stat().st_ctime_ns, cap)
         return found
 
     def _name_of(self, path: Path) -> str | None:

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,12 +56,10 @@ class LoadedFiles:
         """Look at these files; special files, and files that cannot be read, are left out."""
         self._loaded: dict[Path, _Loaded] = {}
         for path in paths:
-            try:
+            with suppress(OSError):
                 if path.is_file():
                     stamp = FileStamp.of(path)
                     self._loaded[path] = _Loaded(stamp, _digest(path, stamp))
-            except OSError:
-                continue
 
     @classmethod
     def of(cls, config: DaemonConfig, package: Path = PACKAGE) -> "LoadedFiles":

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import stat
 import sys
 import threading
 from collections.abc import Callable
@@ -425,6 +426,23 @@ async def test_a_file_is_read_for_the_list_only_after_a_change(folder, slow_driv
     path.unlink()
     assert (await files.list()).names == {}
     assert slow_drive.read == [path, wrong, path]
+
+
+async def test_a_file_that_becomes_readable_is_listed(folder, monkeypatch):
+    """Its content and its time stay. The rights do not hold for root, who may run the tests."""
+    read = experiment_files.read_file
+
+    def read_if_allowed(path: Path, limit: int) -> bytes:
+        if not path.stat().st_mode & stat.S_IRUSR:
+            raise PermissionError
+        return read(path, limit)
+
+    monkeypatch.setattr(experiment_files, "read_file", read_if_allowed)
+    files, path = files_in(folder), write(folder / "one.yaml", VALID)
+    path.chmod(0)
+    assert (await files.list()).names == {}
+    path.chmod(0o644)
+    assert (await files.list()).names == {str(path): "one"}
 
 
 async def test_as_many_requests_wait_for_a_file_as_leave_room_for_others(folder, slow_drive):

@@ -139,7 +139,8 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     if latest is not None and (untared or now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s):
         latest = None
     note = UNTARED.format(driving) if untared else latest.note if latest is not None else ""
-    slowed = arm.slowed_by if (arm := control_loop.inputs.arm) is not None else ()
+    arm = control_loop.inputs.arm if "robot" not in control_loop.inputs.lost else None
+    slowed = arm.slowed_by if arm is not None else ()
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,

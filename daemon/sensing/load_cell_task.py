@@ -2,6 +2,8 @@
 
 import contextlib
 from collections.abc import Sequence
+from itertools import pairwise
+from statistics import median
 
 import structlog
 
@@ -17,6 +19,8 @@ from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 ZERO_SAMPLES = 22
 # The paper's cell, unloaded, changes by 0.0001 N·m in this time. A load that comes or goes would be in the mean.
 LARGEST_CHANGE_NM = 0.005
+# A large cell has more noise. The range of 22 normal values is beyond this many of their median steps twice in 1000.
+NOISE_STEPS = 10.0
 # An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
 
@@ -150,8 +154,11 @@ class LoadCellTask:
         The operator can confirm that a constant torque is no load. A torque that changes is a load.
         """
         calibration = self._board.calibration
-        changed_nm = abs(calibration.torque_nm(max(samples)) - calibration.torque_nm(min(samples)))
-        if changed_nm > LARGEST_CHANGE_NM:
+        torques_nm = [calibration.torque_nm(one) for one in samples]
+        changed_nm = max(torques_nm) - min(torques_nm)
+        # The median step is of the noise, also where a load comes once.
+        step_nm = median(abs(after - before) for before, after in pairwise(torques_nm))
+        if changed_nm > max(LARGEST_CHANGE_NM, NOISE_STEPS * step_nm):
             return f"its torque changed by {changed_nm:.3f} N·m during the tare; keep loads away and tare again"
         if self._judged_by is None:
             self._judged_by = calibration

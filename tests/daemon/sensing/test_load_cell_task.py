@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shearloop.cli.terminal import message_line
@@ -271,6 +272,17 @@ async def test_a_load_that_comes_or_goes_while_a_zero_is_taken_refuses_it(confir
         assert board.tares == []
         assert f"was not taken: its torque changed by {load_nm:.3f} N·m during the tare" in task.diagnostics()["error"]
         assert not task.taring
+
+
+async def test_a_large_cell_with_more_noise_is_tared_and_a_load_beyond_its_noise_is_refused():
+    noise = np.random.default_rng(1).normal(0.0, 0.01, ZERO_SAMPLES)
+    for load_nm, taken in ((0.0, True), (0.3, False)):
+        async with reading() as (task, board):
+            board.calibration = Calibration(nm_per_raw=1.0)
+            task.tare()
+            for number, raw in enumerate(noise):
+                await board.send(raw + load_nm * (number > ZERO_SAMPLES // 2), 1)
+            assert bool(board.tares) is taken
 
 
 async def test_small_loads_in_one_zero_after_the_other_do_not_add_up():

@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 from shearloop.cli.registry import COMMANDS, GROUPS, MOVING, OTHER_SPELLINGS, command_module
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.messaging.deadlines import boot_ns
-from shearloop.daemon.process import number_of, raise_ending_signals
+from shearloop.daemon.process import interrupt_status, raise_ending_signals
 from shearloop.errors import UserError
 from shearloop.printable import OutputError, open_closed_streams, printable_output, silence
 
@@ -152,7 +152,7 @@ def _run(argv: Sequence[str] | None) -> int:
             with contextlib.suppress(OSError):
                 notes = "".join(f". {note}" for note in getattr(interrupt, "__notes__", ()))
                 print(f"{program}: interrupted before it was done{notes}", file=sys.stderr)
-        return 128 + number_of(interrupt)  # as shells say it
+        return interrupt_status(interrupt)
 
 
 def _overview() -> argparse.ArgumentParser:

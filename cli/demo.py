@@ -23,7 +23,7 @@ from shearloop.cli.other_daemon import refuse_second_daemon
 from shearloop.cli.temporary_folders import run_folder
 from shearloop.cli.view import PAGE_PORT
 from shearloop.daemon.messaging.addresses import stop_name
-from shearloop.daemon.process import number_of
+from shearloop.daemon.process import interrupt_status
 from shearloop.errors import UserError
 from shearloop.extras import missing
 from shearloop.tools.outputs import writing
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             _prepare(folder, args.folder / "run", calibrated=args.play is None)
         except KeyboardInterrupt as interrupt:
             # The demo that has started and ended this process says so.
-            return 128 + number_of(interrupt)  # as shells say it
+            return interrupt_status(interrupt)
         return 0
     name = "demo.yaml" if args.play is None else "fingertip_demo.yaml"
     played = [] if args.play is None else ["--play", str(args.play)]

@@ -50,7 +50,7 @@ def raise_ending_signals() -> Iterator[None]:
             previous_hook(dropped)
             return
         # Later: raised in this hook, it would be dropped again.
-        retries.append(threading.Timer(RETRY_S, os.kill, (os.getpid(), number_of(dropped.exc_value))))
+        retries.append(threading.Timer(RETRY_S, os.kill, (os.getpid(), _signal_of(dropped.exc_value))))
         retries[-1].start()
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -77,8 +77,13 @@ def raise_ending_signals() -> Iterator[None]:
             timer.join()
 
 
-def number_of(interrupt: BaseException | None) -> int:
-    """Return the number of the signal behind an interrupt, Ctrl-C's where it has none."""
+def interrupt_status(interrupt: KeyboardInterrupt) -> int:
+    """Return the exit status that shells use: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
+    return 128 + _signal_of(interrupt)
+
+
+def _signal_of(interrupt: BaseException | None) -> int:
+    """Return the signal that interrupted the program: SIGINT where none is noted."""
     return int(interrupt.args[0]) if interrupt is not None and interrupt.args else signal.SIGINT
 
 

@@ -43,9 +43,11 @@ class FrameClock:
 
     def __init__(self, nominal_period_ns: int, longest_gap: float = LONGEST_GAP) -> None:
         self._longest_gap = longest_gap
-        # The period, how many frames it is learned from (0 for the nominal one), and how many were taken since then.
+        # The period, and how many frames it is learned from: 0 for the nominal one.
         self.period_ns = nominal_period_ns
-        self.learned_from = self._taken_since = 0
+        self.learned_from = 0
+        # How many frames were taken since it was learned.
+        self._taken_since = 0
         self._exact_period_ns = float(nominal_period_ns)
         # The number of the last frame, and how many frames up to it waited for their reader.
         self._number = self._waited_in_a_row = 0
@@ -133,8 +135,10 @@ class FrameClock:
         self._learn()
 
     def _learn(self) -> None:
-        spacing = median(self._spacings) if len(self._spacings) == LEARN_FROM else 0.0
-        if spacing <= 0.0:
+        if len(self._spacings) < LEARN_FROM:
+            return
+        spacing = median(self._spacings)
+        if spacing <= 0:
             return
         # A burst of late frames has other spacings before and after it.
         middle = sorted(self._spacings)[LEARN_FROM // 4 : -LEARN_FROM // 4]

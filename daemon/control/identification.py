@@ -90,8 +90,8 @@ class ToolModel:
 class _Fit:
     """Least squares of torque = stiffness·angle + offset + drift·time (0 at the end), residuals (m,).
 
-    `equations` are their left sides, (m + 1, 3): the last one bounds the drift. Of `overlap` neighbouring torques the
-    windows overlap, so that only every such torque brings news.
+    `equations` are their left sides, (m + 1, 3): the last one bounds the drift. The windows of
+    `overlap` neighbouring torques overlap, so that they count as one measurement.
     """
 
     coefficients: FloatArray
@@ -112,7 +112,7 @@ class _Fit:
         return np.asarray(self.squares / degrees * np.linalg.pinv(self.equations.T @ self.equations), np.float64)
 
     def noise_nm(self) -> float:
-        """Return the standard deviation of one torque, from differences (von Neumann 1941) without common states."""
+        """Return the standard deviation of one torque, from torques without overlap (von Neumann 1941)."""
         differences = self.residuals[self.overlap :] - self.residuals[: -self.overlap]
         return float(min(np.sqrt(np.mean(differences**2) / 2.0), np.sqrt(np.mean(self.residuals**2))))
 
@@ -128,7 +128,8 @@ def identify(record: Record, window_s: float, stiffness_share: float = _WORST_ST
     used = np.isfinite(record.torque_nm) & (record.t_mid_s - 0.5 * window_s > record.angle_t_s[0])
     period_s = float(np.median(np.diff(record.t_mid_s))) if record.t_mid_s.size > 1 else math.inf
     overlap = max(1, round(window_s / period_s))
-    if used.sum() < (needed := _MIN_TORQUES * overlap):
+    needed = _MIN_TORQUES * overlap
+    if used.sum() < needed:
         raise NotYetKnownError(
             f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {needed} are needed; "
             f"record for longer, and check why torques are missing"

@@ -138,7 +138,9 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     untared = latest is not None and wrist.source.needs_zero and not control_loop.has_zero(driving)
     if latest is not None and (untared or now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s):
         latest = None
-    note = UNTARED.format(driving) if untared else latest.note if latest is not None else ""
+    note = latest.note if latest is not None else ""
+    if untared:
+        note = UNTARED.format(driving)
     arm = control_loop.inputs.arm if "robot" not in control_loop.inputs.lost else None
     slowed = arm.slowed_by if arm is not None else ()
     return LoopState(

@@ -64,20 +64,6 @@ def test_without_noise_stiffness_and_lag_are_exact(stiffness, lag_s):
     assert found.torque_nm == pytest.approx(0.0, abs=2e-3 * stiffness)
 
 
-def test_the_standard_deviations_are_what_repetition_shows():
-    found = [identify(record_of(lag_s=0.1, seed=seed), WINDOW_S) for seed in range(40)]
-    for name, truth, std in (
-        ("stiffness_nm_per_rad", 0.25, "stiffness_std"),
-        ("lag_s", 0.1, "lag_std_s"),
-        ("torque_nm", 0.0, "torque_std_nm"),
-    ):
-        errors = np.array([getattr(one, name) - truth for one in found])
-        claimed = float(np.mean([getattr(one, std) for one in found]))
-        assert float(np.sqrt(np.mean(errors**2))) == pytest.approx(claimed, rel=0.35)
-        assert abs(float(errors.mean())) < 4.0 * claimed / math.sqrt(len(found))
-    assert float(np.mean([one.noise_nm for one in found])) == pytest.approx(0.012, rel=0.06)
-
-
 def overlapping(seed: int, state_noise_nm: float = 0.07) -> Record:
     """Return a record of the wrench: 25 means a second over 0.192 s each, of 125 noisy states a second."""
     rate, state_s, states = 2.0 * math.pi / 7.0, 0.008, 24
@@ -92,18 +78,27 @@ def overlapping(seed: int, state_noise_nm: float = 0.07) -> Record:
     )  # fmt: skip
 
 
-def test_means_that_overlap_are_no_more_certain_and_no_misfit():
-    """Neighbours share most of their states: their noise seemed half as large, and the rest passed for slip or play."""
-    found = [identify(overlapping(seed), 0.192) for seed in range(40)]
+@pytest.mark.parametrize(
+    ("record", "window_s", "lag_s", "noise_nm"),
+    [
+        (lambda seed: record_of(lag_s=0.1, seed=seed), WINDOW_S, 0.1, 0.012),
+        # Neighbours share most of their states: their noise seemed half as large, and the rest passed for slip or play.
+        (overlapping, 0.192, 0.0, 0.07 / math.sqrt(24)),
+    ],
+    ids=["frames", "means that overlap"],
+)
+def test_the_standard_deviations_are_what_repetition_shows(record, window_s, lag_s, noise_nm):
+    found = [identify(record(seed), window_s) for seed in range(40)]
     for name, truth, std in (
         ("stiffness_nm_per_rad", 0.25, "stiffness_std"),
-        ("lag_s", 0.0, "lag_std_s"),
+        ("lag_s", lag_s, "lag_std_s"),
         ("torque_nm", 0.0, "torque_std_nm"),
     ):
         errors = np.array([getattr(one, name) - truth for one in found])
         claimed = float(np.mean([getattr(one, std) for one in found]))
         assert float(np.sqrt(np.mean(errors**2))) == pytest.approx(claimed, rel=0.35), name
-    assert float(np.mean([one.noise_nm for one in found])) == pytest.approx(0.07 / math.sqrt(24), rel=0.1)
+        assert abs(float(errors.mean())) < 4.0 * claimed / math.sqrt(len(found))
+    assert float(np.mean([one.noise_nm for one in found])) == pytest.approx(noise_nm, rel=0.1)
 
 
 def test_a_lag_within_its_noise_counts_as_none():

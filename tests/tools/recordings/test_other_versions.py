@@ -343,20 +343,11 @@ def test_each_table_has_the_recorded_unit_of_keys_and_topics_of_other_versions(s
     check_table_units(path, tmp_path, expected, ran)
 
 
-def test_no_chart_of_rerun_draws_a_torque_in_another_unit(source, tmp_path, monkeypatch, ran):
-    blueprint = pytest.importorskip("rerun.blueprint", reason="needs the extra `rerun`")
-    charts: dict[str, list[str]] = {}
-    view = blueprint.TimeSeriesView
-
-    def drawn(*, name: str, contents: list[str]) -> Any:
-        charts[name] = contents
-        return view(name=name, contents=contents)
-
-    monkeypatch.setattr(blueprint, "TimeSeriesView", drawn)
+def test_no_chart_of_rerun_draws_a_torque_in_another_unit(source, tmp_path, rerun_charts, ran):
     path = with_definition(source, tmp_path / "x.mcap", "load.torque", "torque_nm", {"unit": "mN·m"})
     ran("recording", "export", path, "--format", "rrd", "--out", tmp_path / "a.rrd")
-    assert "robot/state/wrist_torque_nm" in charts["torque (N·m)"]
-    assert not any("load/torque/torque_nm" in chart for chart in charts.values())
+    assert "robot/state/wrist_torque_nm" in rerun_charts["torque (N·m)"]
+    assert not any("load/torque/torque_nm" in chart for chart in rerun_charts.values())
 
 
 @OTHER_UNIT

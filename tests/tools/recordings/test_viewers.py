@@ -92,21 +92,11 @@ def test_rerun_reads_scalars_images_and_the_pose(topics, tmp_path):
 
 
 @pytest.mark.usefixtures("rerun_runtime")
-def test_a_chart_of_rerun_holds_the_keys_of_one_unit(tmp_path, monkeypatch, ran):
-    from rerun import blueprint
-
-    charts: dict[str, list[str]] = {}
-    view = blueprint.TimeSeriesView
-
-    def drawn(*, name: str, contents: list[str]) -> Any:
-        charts[name] = contents
-        return view(name=name, contents=contents)
-
-    monkeypatch.setattr(blueprint, "TimeSeriesView", drawn)
+def test_a_chart_of_rerun_holds_the_keys_of_one_unit(tmp_path, rerun_charts, ran):
     ran("recording", "export", write(tmp_path / "a.mcap", RIG), "--format", "rrd")
-    shown = {name: {unit_of(entity) for entity in chart} for name, chart in charts.items()}
+    shown = {name: {unit_of(entity) for entity in chart} for name, chart in rerun_charts.items()}
     assert shown == {"torque (N·m)": {"N·m"}, "diameter (mm)": {"mm"}, "shear force (N)": {"N"}, "angle (rad)": {"rad"}}
-    assert "loop/state/stiffness_nm_per_rad" not in {one for chart in charts.values() for one in chart}
+    assert "loop/state/stiffness_nm_per_rad" not in {one for chart in rerun_charts.values() for one in chart}
 
 
 def unit_of(entity: str) -> str:

@@ -245,8 +245,8 @@ def _ends_of_range(
             if gripped_at_rad + reach_rad.high > joints.upper_rad[-1] - joints.margin_rad:
                 ends.append("counterclockwise")
         yield [
-            f"the wrist may stop before its end, because wrist 3 stands near the {end} end of its range: turn it back "
-            "first, with `turn_to` while nothing is held or with freedrive"
+            f"the wrist may stop before the step is done, because wrist 3 stands near the {end} end of its range: turn "
+            "it back first, with `turn_to` while nothing is held or with freedrive"
             for end in ends
         ]
         tool = known_after(step, tool, reaches=False)

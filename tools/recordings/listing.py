@@ -55,12 +55,12 @@ def _listed(path: Path) -> ListedRecording:
         with reading(path), open_file(path) as file:
             check_magic(path, file)
             found = intact_index(file, size)
-            if found is None or found[0].statistics is None:
+            summary = found[0] if found is not None else None
+            if summary is None or summary.statistics is None:
                 file.seek(max(size - len(MCAP0_MAGIC), len(MCAP0_MAGIC)))
                 closed = file.read() == MCAP0_MAGIC
                 return ListedRecording(str(path), size, closed=closed, unreadable=_BAD_INDEX if closed else "")
-            reader, (summary, _) = make_reader(file), found
-            counts = found[0].statistics
+            reader, counts = make_reader(file), summary.statistics
             experiments = [record for record in reader.iter_metadata() if record.name == schema.EXPERIMENT_METADATA]
             follows_wall_clock = any(
                 channel.topic == schema.CLOCK_TOPIC and not has_one_offset(channel.metadata)

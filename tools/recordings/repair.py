@@ -112,8 +112,11 @@ def _copy(records: IntactRecords, source: Path, file: BinaryIO) -> int:
     identity = records.identity or identity
     if identity:
         writer.add_metadata(schema.METADATA, identity)
-    # Without an index the numbers of the messages are all that shows a loss, and show an earlier one again.
-    lost = lost + Counter(records.lost) if records.is_indexed else lost | Counter(records.lost)
+    if records.is_indexed:
+        lost += Counter(records.lost)
+    else:
+        # Without an index, only gaps in the messages' numbers show a loss, and they show an earlier one again.
+        lost |= Counter(records.lost)
     if records.is_damaged or lost:
         writer.add_metadata(REPAIRED_METADATA, {"source": str(source), "lost": json.dumps(lost)})
     writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here

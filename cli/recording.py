@@ -164,8 +164,11 @@ def _summary_text(found: "RecordingSummary") -> str:
     ]
     lines += _damage(found)
     if found.repaired_from is not None:
-        lost = _lost_text(found.lost_in_repair) or "nothing that its source showed"
-        lines.append(f"  It is the repaired copy of {found.repaired_from}; lost there: {lost}.")
+        lost = [_lost_text(found.lost_in_repair)] if found.lost_in_repair else []
+        if found.torn_bytes_in_repair:
+            lost.append(f"{counted(found.torn_bytes_in_repair, 'incomplete byte')} at the end")
+        text = " and ".join(lost) or "nothing that its source showed"
+        lines.append(f"  It is the repaired copy of {found.repaired_from}; lost there: {text}.")
     if found.dropped:
         dropped = counted(found.dropped, "message was", "messages were")
         lines.append(f"  {dropped} dropped because the disk was too slow.")
@@ -309,6 +312,8 @@ def _import(args: argparse.Namespace) -> int:
     from shearloop.daemon.recorder.writer import PARTIAL
     from shearloop.tools.recordings.matlab_import import import_mat
 
+    if args.out.suffix == PARTIAL:
+        raise UserError(f"{args.out} is a name of unfinished recordings; choose another --out, such as twist.mcap")
     # A run that was killed, or still goes on, has its recording under the second name.
     for name in (args.out.name, f"{args.out.name}{PARTIAL}"):
         check_new(args.out.with_name(name))

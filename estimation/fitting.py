@@ -17,6 +17,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.bank_match import BankMatcher
 from shearloop.estimation.calibration import Calibration, check_bank_table
 from shearloop.estimation.channel_imputer import ChannelImputer
+from shearloop.estimation.defaults import LOADED_NM
 from shearloop.estimation.estimator import (
     MIN_DIAMETERS,
     Bounds,
@@ -162,7 +163,7 @@ def _loaded_at_first(recording: FrameSeries) -> str:
     """Return why no frame is idle where the load cell shows a torque from the first frame on, else nothing."""
     torque = recording.torque_at_frames()
     first = torque[np.isfinite(torque)][:MIN_IDLE]
-    if not len(first) or np.abs(first).min() <= LOADED_FRACTION * np.nanmax(np.abs(torque)):
+    if not len(first) or np.abs(first).min() <= max(LOADED_FRACTION * np.nanmax(np.abs(torque)), LOADED_NM):
         return ""
     return (
         f"the load cell shows {np.median(first):+.3f} N·m from the first frame on, so that none is idle: take its zero "

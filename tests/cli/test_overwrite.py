@@ -59,9 +59,10 @@ def test_no_command_overwrites_a_recording(command, tmp_path, mistake):
     if "import" in command:
         killed = tmp_path / "killed.mcap.partial"
         killed.write_bytes(MCAP)
-        for out in (killed, tmp_path / "killed.mcap"):
-            assert f"{killed} exists already" in mistake(*command.split(), "--out", out)
+        assert f"{killed} exists already" in mistake(*command.split(), "--out", tmp_path / "killed.mcap")
         assert killed.read_bytes() == MCAP
+        unfinished = mistake(*command.split(), "--out", tmp_path / "new.mcap.partial")
+        assert "is a name of unfinished recordings" in unfinished
     assert f"{there} exists already" in mistake(*command.split(), "--out", there)
     assert there.read_bytes() == MCAP
 

@@ -98,3 +98,7 @@ def test_a_load_cell_whose_zero_is_off_is_named_instead_of_missing_idle_frames()
     off = replace(recorded, torque_nm=recorded.torque_nm + 2.0 * np.abs(recorded.torque_nm).max())
     with pytest.raises(CalibrationError, match=r"the load cell shows \+\d.* N·m from the first frame on"):
         fit("motion_regression", [off], "rig")
+    flat = replace(recorded, torque_nm=np.full_like(recorded.torque_nm, 1e-4))
+    with pytest.raises(CalibrationError) as told:
+        fit("motion_regression", [flat], "rig")
+    assert "from the first frame on" not in str(told.value), "its zero is right, and nothing was twisted"

@@ -21,7 +21,8 @@ from shearloop.tools.outputs import check_new
 from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import NOTHING_INTACT, IntactRecords, Progress
 
-# The metadata record of a copy that is repaired: its source, and the numbers of lost messages by topic, as JSON.
+# The metadata record of a copy that is repaired: its first source, the numbers of lost messages by topic, as JSON, and
+# of incomplete bytes at the end.
 REPAIRED_METADATA = "shearloop.repaired"
 
 
@@ -90,6 +91,8 @@ def _copy(records: IntactRecords, source: Path, file: BinaryIO) -> int:
     channels: dict[int, int] = {}
     identity: dict[str, str] = {}
     lost: Counter[str] = Counter()
+    # What a copy that is copied again says of its own repair.
+    earlier: dict[str, str] = {}
     messages = 0
     for record in records:
         match record:
@@ -101,7 +104,8 @@ def _copy(records: IntactRecords, source: Path, file: BinaryIO) -> int:
                 writer.add_message(*copied, record.sequence)
                 messages += 1
             case Metadata(name=name) if name == REPAIRED_METADATA:
-                lost.update(lost_in_repair(record.metadata))
+                earlier = dict(record.metadata)
+                lost.update(lost_in_repair(earlier))
             case Metadata(name=schema.METADATA):
                 identity = record.metadata
             case Metadata():
@@ -117,8 +121,10 @@ def _copy(records: IntactRecords, source: Path, file: BinaryIO) -> int:
     else:
         # Without an index, only gaps in the messages' numbers show a loss, and they show an earlier one again.
         lost |= Counter(records.lost)
-    if records.is_damaged or lost:
-        writer.add_metadata(REPAIRED_METADATA, {"source": str(source), "lost": json.dumps(lost)})
+    if records.is_damaged or earlier:
+        first = {"source": earlier.get("source", str(source)), "lost": json.dumps(lost)}
+        torn_bytes = records.torn_bytes + torn_in_repair(earlier)
+        writer.add_metadata(REPAIRED_METADATA, {**first, "torn_bytes": str(torn_bytes)})
     writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
     return messages
 
@@ -130,6 +136,12 @@ def lost_in_repair(metadata: Mapping[str, str]) -> dict[str, int]:
     except (ValueError, TypeError, AttributeError):
         # Another program has changed them.
         return {}
+
+
+def torn_in_repair(metadata: Mapping[str, str]) -> int:
+    """Return the number of incomplete bytes at the end of its source that the metadata of a repaired copy name."""
+    text = metadata.get("torn_bytes", "0")
+    return int(text) if text.isdecimal() else 0
 
 
 def _registered(writer: Writer, channel: Channel, records: IntactRecords, schemas: dict[str, int]) -> int:

@@ -15,7 +15,7 @@ from shearloop.tools.recordings.message_content import read_content
 from shearloop.tools.recordings.monotonic_times import MonotonicTimes
 from shearloop.tools.recordings.reader import reading
 from shearloop.tools.recordings.recorded_columns import ContentError, TopicColumns, recorded_topic
-from shearloop.tools.recordings.repair import REPAIRED_METADATA, lost_in_repair
+from shearloop.tools.recordings.repair import REPAIRED_METADATA, lost_in_repair, torn_in_repair
 
 # Fewer messages, or a shorter time, say nothing of a rate.
 MIN_RATED_MESSAGES, MIN_RATED_S = 3, 1.0
@@ -81,6 +81,8 @@ class RecordingSummary(FileCondition):
     # The file that a copy was repaired from, and the messages by topic that were lost there.
     repaired_from: str | None
     lost_in_repair: dict[str, int]
+    # The incomplete bytes at its end, which may have held further ones.
+    torn_bytes_in_repair: int
     # The tool's diameter in mm as the recording names it.
     tool_mm: str | None
     metadata: dict[str, str]
@@ -144,6 +146,7 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
         experiments=[experiment.get("name", "") for experiment in experiments],
         repaired_from=repaired.get("source"),
         lost_in_repair=lost_in_repair(repaired),
+        torn_bytes_in_repair=torn_in_repair(repaired),
         tool_mm=(experiments or [metadata])[-1].get(schema.DIAMETER_NOTE),
         metadata=metadata,
         attachments=attachments,

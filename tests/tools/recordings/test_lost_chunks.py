@@ -132,8 +132,14 @@ def test_a_topic_defined_in_the_first_chunk_only_is_taken_from_the_index(tmp_pat
     copy = result.path
     copy.write_bytes(copy.read_bytes()[:-20])
     again = repair(copy)
-    assert summarise(again.path).lost_in_repair == {"load.torque": 1}
-    assert f"the repaired copy of {copy}; lost there: 1 of load.torque" in ran("recording", "info", again.path).out
+    third = repair(again.path, tmp_path / "third.mcap")
+    for one in (again, third):
+        summary = summarise(one.path)
+        assert (summary.repaired_from, summary.lost_in_repair) == (str(path), {"load.torque": 1})
+        assert summary.torn_bytes_in_repair == again.torn_bytes
+        said = ran("recording", "info", one.path).out
+        assert f"the repaired copy of {path}; lost there: 1 of load.torque" in said
+        assert ("incomplete byte" in said) is (again.torn_bytes > 0)
 
 
 def test_bytes_of_a_damaged_chunk_that_look_like_a_record_cost_no_other_chunk(tmp_path):

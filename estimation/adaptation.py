@@ -86,9 +86,10 @@ class GripGain:
         largest_nm = float(np.abs(truth).max(initial=0.0))
         features, truth = features[~settling], truth[~settling]
         if settling.any() and not find_twists(truth, largest_nm):
+            unknown = "" if known.all() else f" ({(~known).sum()} of its {len(known)} frames have no known torque)"
             raise CalibrationError(
-                "the first twist after a grip settles the gel and shows another gain than the later ones; twist again, "
-                "then adapt"
+                f"this grip has no second twist of known torque{unknown}, and the first one settles the gel and shows "
+                "another gain than the later ones; twist again, then adapt"
             )
         before = self.models(calibration, tool, whole)["torque"]
         adapted, correction = calibration.correct_gain(features, truth)

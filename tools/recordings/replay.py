@@ -87,12 +87,12 @@ class RecordedEvent:
 class ReplayEvents(NamedTuple):
     """What the frames do not contain: by source, what comes before each.
 
-    `frame_numbers` holds the frames' numbers by source and arrival, `sample_numbers` the skin samples' numbers by
-    their time; they continue from file to file.
+    `frame_numbers` holds the frames' times and numbers by source and arrival, `sample_numbers` the numbers of the
+    skin's samples by their time; they continue from file to file.
     """
 
     before_frames: dict[str, "RecordedBefore"]
-    frame_numbers: dict[str, dict[int, int]]
+    frame_numbers: dict[str, dict[int, list[tuple[int, int]]]]
     sample_numbers: dict[int, int]
 
 
@@ -249,13 +249,13 @@ class RecordedRun:
 
     def replay_events(self) -> ReplayEvents:
         """Return the events that the frames do not contain."""
-        found = ReplayEvents(defaultdict(RecordedBefore), defaultdict(dict), {})
+        found = ReplayEvents(defaultdict(RecordedBefore), defaultdict(lambda: defaultdict(list)), {})
         for event in self.events() if self.has_inputs else ():
             with reading(self.path):
                 match event:
                     case RecordedEvent(topic=messages.EitFrame.topic, content=content):
                         arrival_ns = event.t_mono_ns + round(content["age_s"] * 1e9)
-                        found.frame_numbers[event.source][arrival_ns] = content["frame"]
+                        found.frame_numbers[event.source][arrival_ns].append((event.t_mono_ns, content["frame"]))
                     case RecordedEvent(topic=messages.SkinShear.topic, content=content):
                         found.sample_numbers[event.t_mono_ns] = content["sample"]
                     # The tares of the load cell and of the skin are of no frame.
@@ -528,10 +528,12 @@ class Replay:
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
         """Return frames with their recorded numbers: a later file of a run continues to count, as after lost input."""
         if frames:
-            # The first of several frames may have begun in the file before.
-            number = self._events.frame_numbers[source].get(frames[-1].t_arrival_ns)
-            if number is not None:
-                self._number_offset[source] = number - frames[-1].seq
+            # Several frames can arrive together. The first may have begun in the file before, and the last may have
+            # been published after the end of this file, so that the nearest times tell which frame is which.
+            recorded = self._events.frame_numbers[source].get(frames[0].t_arrival_ns, [])
+            places = [(abs(frame.t_mid_ns - t_ns), number - frame.seq) for frame in frames for t_ns, number in recorded]
+            if places:
+                _, self._number_offset[source] = min(places)
         offset = self._number_offset.get(source, 0)
         return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
 

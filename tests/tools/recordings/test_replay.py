@@ -353,6 +353,39 @@ def test_lines_that_waited_at_an_opening_explain_what_earlier_code_counted(confi
     assert "3 lines may have waited in a port before it was opened: this code drops such lines, and earlier" in said
 
 
+@pytest.mark.parametrize("kept", [slice(None, -1), slice(1, None)], ids=["last published later", "first before"])
+def test_a_file_may_hold_one_of_two_frames_that_arrived_together(config, tmp_path, kept):
+    loaded = load_daemon_config(config(right=PLAYED))
+    identity = daemon_identity(loaded, open_sessions(loaded).fingertips)
+    _, lines = recording(tmp_path, 5)
+    opened_ns, period_ns = Clock().now_ns(), round(loaded.fingertips["right"].frame_period_s * 1e9)
+
+    def recorded(folder: str, number: int, messages: Messages) -> Path:
+        recorder = Recorder(tmp_path / folder, identity, Clock())
+        inputs = recorder.input_recorder("right")
+        inputs.record(RawEvent(InputKind.OPENED, opened_ns))
+        for count, line in enumerate(map(format_line, lines[:3]), 1):
+            inputs.record(RawEvent(InputKind.DATA, opened_ns + count * period_ns, line))
+        together = b"".join(map(format_line, lines[3:]))
+        inputs.record(RawEvent(InputKind.DATA, opened_ns + 5 * period_ns, together))
+        for topic, content in messages:
+            if topic == "eit.frame":
+                recorder.record_message(topic, content | {"frame": content["frame"] + number})
+        recorder.close()
+        (path,) = recorder.closed_files
+        return path
+
+    computed, _ = asyncio.run(replayed(recorded("inputs", 0, []), math.inf))
+    frames = [one for one in computed if one[0] == "eit.frame"]
+    *_, before, after = frames
+    assert before[1]["t_mono_ns"] + round(before[1]["age_s"] * 1e9) == after[1]["t_mono_ns"] + round(
+        after[1]["age_s"] * 1e9
+    ), "they arrived together"
+    # A later file of a run, whose first frame has the number 100.
+    _, comparison = asyncio.run(replayed(recorded("frames", 100, frames[-2:][kept]), math.inf))
+    assert (comparison.different, comparison.compared["eit.frame"]) == ({}, 1), comparison.examples
+
+
 STATED = 40
 
 

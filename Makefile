@@ -68,7 +68,7 @@ test: install-dev
 	+$(MAKE) --no-print-directory --jobs=2 --keep-going test-computing test-waiting
 
 test-long: install-dev
-	+$(MAKE) --no-print-directory test LENGTH=long IN_REAL_TIME=2
+	+$(MAKE) --no-print-directory test LENGTH=long IN_REAL_TIME=3
 
 test-computing: install-dev
 	mkdir -p build

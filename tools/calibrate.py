@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from shearloop.bank.bank_file import Bank
+from shearloop.errors import UserError
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.estimation.bank_match import find_numberings
 from shearloop.estimation.estimator_names import EstimatorName
@@ -18,7 +19,7 @@ from shearloop.estimation.values import Measured
 from shearloop.tools.frame_series import (
     check_no_copies,
     check_paths_differ,
-    check_tool_counts,
+    not_of_tool,
     part_of,
     read_series,
     series_of,
@@ -178,7 +179,6 @@ def read_parts(
         others += [(f"{path.name}, {series.sides[0]}", part_of(series, *time_range)) for series in not_fitted]
     parts = [part for _, part in chosen]
     check_no_copies([(str(path), part) for path, part in chosen])
-    check_tool_counts([(str(path), part) for path, part in chosen], tool_mm)
     if load_cell_delay_s:
         parts = [replace(part, torque_t_s=part.torque_t_s - load_cell_delay_s) for part in parts]
     timing = TRUSTED if load_cell_delay_s is not None else measure_timing(parts, [part for _, part in others])
@@ -189,6 +189,7 @@ def read_parts(
     warned = [pair for pair in zip(timing.references, timing.warnings, strict=True) if pair[1]]
     doubts = [f"{name}: {why}" for name, part in named for reference, why in warned if part is reference]
     left_out = [f"{path.name}: {'; '.join(part.left_out)}" for path, part in chosen if part.left_out]
+    left_out += not_of_tool([(path.name, part) for path, part in chosen], tool_mm)
     return ReadParts(parts, [path for path, _ in chosen], timing, doubts, left_out)
 
 
@@ -210,7 +211,8 @@ def adapt_to_recordings(
     start, stop = time_range
     named = [(str(path), recording) for path in paths for recording in read_series(path, calibration.sides, tool_mm)]
     check_no_copies(named)
-    check_tool_counts(named, tool_mm)
+    if others := not_of_tool(named, tool_mm):
+        raise UserError(f"the recordings are not of one tool: left out would be {others[0]}; adapt to one tool")
     series = [recording for _, recording in named]
     # Earlier frames show the session the idle fingertip.
     until = [

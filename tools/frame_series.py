@@ -189,16 +189,25 @@ def check_paths_differ(paths: Sequence[Path]) -> None:
             raise UserError(f"{path} is given twice{also}; name it once: a copy adds nothing")
 
 
-def check_tool_counts(series: Sequence[tuple[str, FrameSeries]], tool_mm: float | None) -> None:
-    """Raise UserError for a stated diameter that no recording takes, because each names another."""
+def not_of_tool(series: Sequence[tuple[str, FrameSeries]], tool_mm: float | None) -> list[str]:
+    """Return the recordings where a stated diameter does not count, because they name another, and why.
+
+    Raises UserError if it counts nowhere.
+    """
     tools = [(name, recording.tool_mm) for name, recording in series]
-    if tool_mm is None or any(tool is None or tool.value == tool_mm for _, tool in tools):
-        return
-    name, tool = next((name, tool) for name, tool in tools if tool is not None)
-    raise UserError(
-        f"{name} names its tool, of {tool.value:g} mm, and --tool-mm {tool_mm:g} counts only where nothing names one: "
-        "leave it out, or import or record again under the right diameter"
-    )
+    if tool_mm is None:
+        return []
+    others = [(name, tool.value) for name, tool in tools if tool is not None and tool.value != tool_mm]
+    if others and len(others) == len(series):
+        name, diameter_mm = others[0]
+        raise UserError(
+            f"{name} names its tool, of {diameter_mm:g} mm, and --tool-mm {tool_mm:g} counts only where nothing names "
+            "one: leave it out, or import or record again under the right diameter"
+        )
+    return [
+        f"{name}: --tool-mm {tool_mm:g}, because the recording names its tool, of {diameter_mm:g} mm"
+        for name, diameter_mm in others
+    ]
 
 
 def check_no_copies(series: Sequence[tuple[str, FrameSeries]]) -> None:

@@ -35,9 +35,11 @@ def run(args: argparse.Namespace) -> int:
     found = fit_creep(grips)
     doubts = known_data(calibration.learned, tracks, [path for path, _ in named])
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
+    low_s, high_s = (round(end_s, 1) for end_s in found.time_range_s)
     result = {
         "share": share,
         "time_s": time_s,
+        "time_range_s": [low_s, high_s],
         "grips": len(grips),
         "frames": sum(grip.t_s.size for grip in grips),
         "error_before_nm": found.before_nm,
@@ -48,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     }
     sentences = [
         f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
+        f"The time constant lies between {low_s} s and {high_s} s (95 % interval).",
         f"From {result['frames']} frames of {counted(len(grips), 'grip')}: the estimates, scaled by {found.scale:.3f} "
         f"and shifted by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} "
         f"mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",

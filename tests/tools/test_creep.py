@@ -38,7 +38,7 @@ def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear():
 @pytest.mark.long
 def test_noise_shifts_neither_the_time_nor_the_scale_but_widens_what_is_found():
     """Fitted the other way round, torque to readings, 12 mN·m of noise make 20 s 50 s and the scale 0.95."""
-    times, shears, torques = twisted(600.0)
+    times, shears, torques = twisted(900.0)
     random = np.random.default_rng(5)
     found = [fit_creep([Stretch(times, shears + random.normal(0, 0.012, times.size), torques)]) for _ in range(8)]
     assert np.median([one.creep.time_s for one in found]) == pytest.approx(20.0, rel=0.3)
@@ -61,6 +61,41 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep():
     # Taken as right, it looks like a creep that is faster than any gel's.
     with pytest.raises(UserError, match="by 2 s or less, and a gel creeps for longer"):
         fit_creep([Stretch(times, 1.1 * shears, torques)], scale_is_right=True)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_the_interval_of_the_time_constant_holds_the_true_one(correlation):
+    """Also where an estimator's error is slow, so that neighbouring frames say nearly the same."""
+    times, shears, torques = twisted(300.0)
+    random = np.random.default_rng(1)
+    held, intervals = 0, []
+    for _ in range(40):
+        noise = random.normal(0, 0.002, times.size)
+        for index in range(1, times.size):
+            noise[index] = correlation * noise[index - 1] + np.sqrt(1 - correlation**2) * noise[index]
+        try:
+            low_s, high_s = fit_creep([Stretch(times, shears + noise, torques)]).time_range_s
+        except UserError:
+            # The interval had no end.
+            continue
+        held += low_s <= 20.0 <= high_s
+        intervals.append(high_s / low_s)
+    assert len(intervals) >= 20
+    assert held >= 0.85 * len(intervals)
+    assert np.median(intervals) < (5.0 if correlation else 2.0)
+
+
+def test_holds_that_do_not_tell_the_time_constant_are_refused():
+    """A creep of 60 s in holds of 10 s looks like any other that is slow."""
+    twin = Twin(TwinSettings(hysteresis_rad=0.0, relaxation_s=60.0))
+    times = np.arange(0.0, 100.0, PERIOD_S)
+    states = [twin.step(PERIOD_S, 0.15 if t_s % 20 < 10 else 0.0, 60.0) for t_s in times]
+    shears = np.array([state.shear_torque_nm for state in states])
+    torques = np.array([state.torque_nm for state in states])
+    noise = np.random.default_rng(4).normal(0, 0.003, times.size)
+    with pytest.raises(UserError, match=r"do not tell how fast the gel creeps: time constants from \d+ s to \d+ s"):
+        fit_creep([Stretch(times, shears + noise, torques)])
 
 
 @pytest.mark.parametrize(("fingertip_nm", "load_cell_nm"), [(0.02, 0.0), (0.0, 0.005)])
@@ -138,7 +173,10 @@ def test_it_prints_the_line_of_the_configuration(monkeypatch, ran, tmp_path, res
     assert result["time_s"] == pytest.approx(20.0, rel=0.5)
     assert result["error_after_nm"] == pytest.approx(0.002, rel=0.15)
     assert result["error_before_nm"] > 1.1 * result["error_after_nm"]
-    line, followed, beside = ran(*arguments).out.splitlines()
+    line, between, followed, beside = ran(*arguments).out.splitlines()
+    low_s, high_s = result["time_range_s"]
+    assert low_s < result["time_s"] < high_s < 2.0 * low_s
+    assert between == f"The time constant lies between {low_s} s and {high_s} s (95 % interval)."
     assert f"scaled by {result['scale']:.3f} and shifted by {1e3 * result['offset_nm']:+.1f} mN·m, follow" in followed
     assert "does not correct scale and zero" in beside
     assert line == f"creep: {{share: {result['share']:g}, time_s: {result['time_s']:g}}}"

@@ -14,7 +14,7 @@ from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
 from shearloop.estimation import BeforeFrame, HeldTool, Measured
-from shearloop.tools.frame_series import check_tool_counts, read_series, series_of
+from shearloop.tools.frame_series import not_of_tool, read_series, series_of
 from shearloop.tools.recordings.frames import read_recording
 from shearloop.tools.recordings.summary import summarise
 from tests.sample_messages import sample
@@ -73,10 +73,11 @@ def test_a_stated_tool_that_counts_nowhere_is_refused(tmp_path):
     paths = recorded(tmp_path / "named", named_mm=20.0), recorded(tmp_path / "unnamed")
     named, unnamed = ((path.parent.name, *read_series(path, tool_mm=30.0)) for path in paths)
     with pytest.raises(UserError, match="named names its tool, of 20 mm, and --tool-mm 30 counts only where nothing"):
-        check_tool_counts([named], 30.0)
-    check_tool_counts([named, unnamed], 30.0)
-    check_tool_counts([named], 20.0)
-    check_tool_counts([named], None)
+        not_of_tool([named], 30.0)
+    assert not_of_tool([named, unnamed], 30.0) == [
+        "named: --tool-mm 30, because the recording names its tool, of 20 mm"
+    ]
+    assert not_of_tool([named], 20.0) == not_of_tool([named, unnamed], None) == []
 
 
 def test_a_recording_knows_which_frames_saw_the_fingers_move(tmp_path):

@@ -373,8 +373,8 @@ class DaemonConfig(ConfigModel):
         if not self.fingertips and self.skin is None and self.load_cell is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin` or a `load_cell`")
         if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):
-            text = f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is"
-            raise ValueError(f"{text}: try right or left")
+            text = f"`fingertips.{taken[0]}` has the name of another part of the daemon"
+            raise ValueError(f"{text}: name the fingertip right or left")
         if self.combined is not None and len(self.fingertips) < 2:
             raise ValueError("`combined` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():

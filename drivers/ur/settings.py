@@ -347,7 +347,7 @@ class UrSettings(_Checked):
     def __post_init__(self) -> None:
         """Refuse an invalid host."""
         if reason := why_no_address(self.host):
-            raise ValueError(f"host {reason}")
+            raise ValueError(f"`host` {reason}")
         if self.state_timeout_s > _LONGEST_STATE_S and not is_loopback_host(self.host):
             raise ValueError(
                 f"state_timeout_s: {self.state_timeout_s:g} s is above {_LONGEST_STATE_S:g} s, and {self.host} is not "

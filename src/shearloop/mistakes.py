@@ -20,6 +20,8 @@ from shearloop.words import counted, shown
 
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
+# A key that a sentence begins with, or names in backticks, alone or with its value: `loop.kp: 3`.
+_NAMED_KEY = re.compile(r"(?:^|`)([a-z][a-z0-9_.]*)(?:: |`)")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
 _MAX_MISTAKES = 100
@@ -93,6 +95,8 @@ def mistake_lines(
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
         sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
+        if kind == "value_error":
+            line = _line_of_named(sentence, location, content, root) or line
         is_number = wrong_key and str(location[-1]).isdecimal()
         if is_number and root is not None and not _written(location, content, root, key=False):
             # In braces, YAML reads the part behind a comma as a key without a value.
@@ -125,6 +129,19 @@ def place_of(
         node = child
         key += f"[{part}]" if isinstance(part, int) else f".{part}"
     return key.lstrip("."), line
+
+
+def _line_of_named(sentence: str, location: Sequence[int | str], content: object, root: yaml.Node | None) -> int | None:
+    """Return the line of the first key in a section that a sentence names, None if it names none.
+
+    A rule of several keys is broken by the section that has them, and its first line says nothing.
+    """
+    for named in _NAMED_KEY.findall(sentence):
+        place = (*location, *named.split("."))
+        key, line = place_of(place, content, root, missing=False)
+        if key.endswith(named):
+            return line
+    return None
 
 
 def _pair(content: Mapping[Any, object], key: int | str, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:

@@ -120,7 +120,10 @@ def test_check_and_run_say_the_same_of_a_file_of_another_kind(name, mistake):
         ({"experiment": "", "robot": "ur.yaml"}, ["experiment: must be the path of a file, not '.'"]),
         ({"robot": "a\0b"}, ["robot: must be the path of a file"]),
         ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
-        ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
+        (
+            {"fingertips": {"load_cell": {"device": {"path": "eit"}}}},
+            ["`fingertips.load_cell` has the name of another"],
+        ),
         (fingertip(), ["no.bank", "shearloop bank build"]),
         (fingertip(device={}), ["device", "either serial_number or path"]),
         (fingertip(device={"path": "eit", "serial_number": "1"}), ["either serial_number or path"]),

@@ -391,3 +391,33 @@ def test_a_wrong_length_names_the_limit(tmp_path):
 def test_an_empty_value_counts_as_none_of_two_keys(tmp_path):
     said = refused(tmp_path, "load_cell: {device: {serial_number: }}\n", DaemonConfig)
     assert "load_cell.device: give either serial_number or path, with a value, and not both" in said
+
+
+@pytest.mark.parametrize(
+    ("written", "line", "named"),
+    [
+        (
+            "name: rig\nemulated: true\nload_cell:\n  device: {path: /dev/ttyACM0}\n",
+            2,
+            "`emulated: true` and `load_cell",
+        ),
+        (
+            "load_cell: {device: {path: a}}\npublish: tcp://0.0.0.0:7761\n",
+            2,
+            "`publish: tcp://0.0.0.0:7761` would open",
+        ),
+        ("load_cell: {device: {path: a}}\nautostart: true\n", 2, "`autostart` moves the robot without a command"),
+        (
+            "fingertips:\n  left: {device: {path: a}}\n  load_cell: {device: {path: b}}\n",
+            3,
+            "`fingertips.load_cell` has",
+        ),
+        ("load_cell: {device: {path: a}}\n\nexperiment: a.yaml\n", 3, "an experiment needs a robot"),
+        ("name: rig\n", 1, "nothing is measured"),
+    ],
+)
+def test_a_rule_of_several_keys_is_shown_at_the_first_of_them(written, line, named, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(written)
+    with pytest.raises(UserError, match=re.escape(f"{path}:{line}: {named}")):
+        load_daemon_config(path)

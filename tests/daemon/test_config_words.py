@@ -135,7 +135,7 @@ def test_a_robot_and_its_gripper_are_not_given_by_a_name(addresses, cure, tmp_pa
     assert f"gripper.socket.host: 'ur5.lab' {name} {cure}" in refusal(tmp_path, content)
     robot = tmp_path / "ur.yaml"
     robot.write_text(Path("config/ur.yaml").read_text().replace("host: 192.168.1.10", "host: ur5.lab"))
-    with pytest.raises(DriverError, match=re.escape(f"host {name} {cure}")):
+    with pytest.raises(DriverError, match=re.escape(f"`host` {name} {cure}")):
         read_settings(robot)
     options = ("--model", "2F-140", "--diameter-mm", 10, "--diameter-mm", 20, "--out", tmp_path / "g.cal")
     said = ran("calibrate", "gripper", "--host", "ur5.lab", *options, status=2).err

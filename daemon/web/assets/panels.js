@@ -406,17 +406,11 @@ export function loopPanel(link) {
   else if (stop) title = `Stopped: ${current.response}`;
   put(byId("holding-title"), title);
   put(byId("cause"), current.cause || reasons);
-  put(byId("stop-times"), stopped ? stopTimes(link, current) : "");
+  const times = stopped ? message.stop_times : "";
+  put(byId("stop-times"), times && `${times[0].toUpperCase()}${times.slice(1)}.`);
   // `reasons` begins with the cause.
   const others = current.cause ? reasons.slice(current.cause.length).trim() : "";
   show(byId("others"), others !== "");
   put(byId("other-codes"), [...new Set(codes.slice(1))].join(", ") || "more");
   put(byId("other-reasons"), others);
-}
-
-// The times of the stop of this run.
-function stopTimes(link, current) {
-  const stop = link.get("loop.stop");
-  if (stop?.content.run !== current.run) return "";
-  return `${stop.times[0].toUpperCase()}${stop.times.slice(1)}.`;
 }

@@ -302,6 +302,22 @@ def test_a_stop_has_the_times_of_its_own_run(browsed):
     browsed.until("#stop-times", "standstill after 0.200 s")
 
 
+def test_a_stop_without_times_does_not_show_those_of_an_acknowledged_one(browsed):
+    """STOP while nothing is under way has no times."""
+    stopped = {"phase": "stopped", "response": "stop and keep grip", "cause": CAUSE, "reasons": CAUSE}
+    browsed.open()
+    browsed.daemon.say(loop={**stopped, "stop": 1})
+    browsed.until("#stop-times", "standstill after 0.123 s")
+    browsed.daemon.say(loop={"phase": "idle", "stop": 0}, stop=None)
+    browsed.until("#phase-name", "idle")
+    browsed.daemon.say(loop={**stopped, "stop": 2}, stop=None)
+    browsed.until("#phase-name", "stopped")
+    assert browsed.text("#stop-times") == ""
+    browsed.open()
+    browsed.until("#phase-name", "stopped")
+    assert browsed.text("#stop-times") == ""
+
+
 @pytest.mark.parametrize(
     ("reason", "waits"),
     [("gripped too recently: 4 more", True), (f"{FINGERS_MOVED}; no grip", True), ("another gel", False)],

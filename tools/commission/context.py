@@ -215,6 +215,17 @@ class Context:
         way = 1.0 if to_rad > self.observer.latest().wrist_rad else -1.0
         self.mover.move("turn", rad_per_s=way * rad_per_s, to_rad=to_rad)
 
+    def return_to_pose(self, rad_per_s: float) -> None:
+        """Turn the wrist back to the confirmed pose, where another stage has left it elsewhere."""
+        here_rad, pose_rad = self.observer.latest().wrist_rad, self.pose_rad
+        if abs(here_rad - pose_rad) > _SAME_POSE_RAD:
+            self.ready()
+            self.operator.allow(
+                f"wrist 3 turns back to the confirmed pose, from {here_rad:.3f} to {pose_rad:.3f} rad at "
+                f"{rad_per_s:g} rad/s"
+            )
+            self.turn_to(pose_rad, rad_per_s)
+
     def ready(self) -> Mover:
         """Return what drives the robot once the robot is ready to move; raises UserError."""
         if refusal := self.mover.unlock():

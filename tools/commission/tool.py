@@ -87,6 +87,8 @@ def measure(context: Context) -> Measured:
     cell = context.config.load_cell
     if cell is None:
         return Measured([Line(what="tool and spring", value="not measured: no load cell is configured")])
+    # Before anything holds the tool: it is then twisted by the announced angles, and by no more.
+    context.return_to_pose(_SLOWLY_RAD_PER_S)
     spring = context.operator.number(
         "Mount the tool on a spring of known stiffness; stiffness of spring and pads together in N·m/rad",
         *(_SOFTEST, _STIFFEST),

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from shearloop.daemon.report_validity import load_report
 from shearloop.daemon.rig import open_settings
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED
 from shearloop.errors import UserError
-from shearloop.tools.commission import stops
+from shearloop.tools.commission import stops, tool
 from shearloop.tools.commission.bounds import LARGEST_RAD
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.hand_stops import LAYERS, stops_of_layer
@@ -393,6 +394,25 @@ def test_a_program_that_replaced_the_commissionings_is_asked_about_before_the_ne
         with pytest.raises(UserError, match="end the other daemon, or stop the program at the teach pendant"):
             context.expect_no_other_program()
         assert lab.operator.asked == [], "the program may be another daemon's, and the worker refuses to end it"
+
+
+@pytest.mark.long
+def test_a_held_tool_is_twisted_by_the_announced_angle_wherever_the_stage_before_left_the_wrist(lab, monkeypatch):
+    """The stage of motion ends beside the pose."""
+    turned_rad = []
+
+    def noted(before: tool.Held, after: tool.Held, *others: Any, **options: Any) -> list[Line]:
+        turned_rad.append(after.wrist_rad - before.wrist_rad)
+        return judge_signs(before, after, *others, **options)
+
+    judge_signs = tool.judge_signs
+    monkeypatch.setattr(tool, "judge_signs", noted)
+    report, _ = lab.run("37")
+    assert failed(report) == []
+    assert turned_rad == [pytest.approx(tool.TURN_RAD, abs=0.015)]
+    motions = [one for one in lab.operator.asked if "MOTION" in one]
+    back = next(number for number, one in enumerate(motions) if "back to the confirmed pose, from -" in one)
+    assert "close onto the tool" in motions[back + 1], "nothing is held yet"
 
 
 @pytest.mark.long

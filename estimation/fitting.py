@@ -29,6 +29,7 @@ from shearloop.estimation.estimator import (
     Reading,
 )
 from shearloop.estimation.estimator_names import EstimatorName, estimator_class
+from shearloop.estimation.fingertip_validator import LARGEST_DEVIATION, compare_frames
 from shearloop.estimation.gain import ToolLaw
 from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.gain_fit import fit_tool_law
@@ -130,24 +131,42 @@ def _tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
 def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
     """Return what an estimator is prepared from."""
     grips = [
-        (recording.channels, grip)
+        (number, recording.channels, grip)
         for number, recording in enumerate(recordings, 1)
         for grip in _clear_grips(recording, number, len(recordings))
     ]
-    validators = tuple(
-        fit_validator(
-            side,
-            *(
-                GripParts(frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])
-                for frames, grip in grips
-            ),
-        )
-        for layer, side in enumerate(recordings[0].sides)
-    )
-    gripped = [frames[grip.gripped] for frames, grip in grips]
+    validators = []
+    for layer, side in enumerate(recordings[0].sides):
+        parts = [
+            GripParts(frames[grip.idle, layer], frames[grip.gripped, layer], frames[grip.released, layer])
+            for _, frames, grip in grips
+        ]
+        _check_one_fingertip(side, [(number, part) for (number, *_), part in zip(grips, parts, strict=True)])
+        validators.append(fit_validator(side, *parts))
+    gripped = [frames[grip.gripped] for _, frames, grip in grips]
     return Material(
-        np.array([validator.noise for validator in validators]), physics, recordings[0].table, validators, gripped
+        np.array([validator.noise for validator in validators]),
+        physics,
+        recordings[0].table,
+        tuple(validators),
+        gripped,
     )
+
+
+def _check_one_fingertip(side: str, parts: Sequence[tuple[int, GripParts]]) -> None:
+    """Raise CalibrationError where idle frames deviate from the first ones' as another fingertip's do.
+
+    `parts` are of a side, each with the number of its recording.
+    """
+    first, *_ = idle_frames = [np.median(part.idle, axis=0) for _, part in parts]
+    for (number, _), idle in zip(parts, idle_frames, strict=True):
+        deviation = float(compare_frames(idle, first[None])[2][0])
+        if deviation > LARGEST_DEVIATION:
+            raise CalibrationError(
+                f"recording {number} is of another {side} fingertip or gel than recording {parts[0][0]}: its idle "
+                f"voltages deviate by {100 * deviation:.0f} %, more than {100 * LARGEST_DEVIATION:.0f} %. Leave it "
+                "out, or import it again if its sides are exchanged"
+            )
 
 
 def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:
@@ -179,6 +198,12 @@ def _fit_outputs(
     rows, refused = _replay(calibration, matcher, recordings)
     if rows is None:
         raise CalibrationError(f"no frame of the recordings can be calibrated on: {_most_frequent(refused)}")
+    for number in range(len(recordings)):
+        if number not in rows.recording:
+            why = _most_frequent([one for one in refused if one.recording == number])
+            raise CalibrationError(
+                f"no frame of recording {number + 1} of {len(recordings)} can be calibrated on: {why}"
+            )
     estimator = calibration.estimator
     if not estimator.imputes_by_motion:
         estimator = replace(estimator, imputer=ChannelImputer.fit(rows.position, calibration.validators))

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 
+import numpy as np
+
 from shearloop.bank.bank_file import Bank
-from shearloop.errors import UserError
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, LoadTiming, Physics, adapt, fit, measure_timing
 from shearloop.estimation.bank_match import find_numberings
 from shearloop.estimation.estimator_names import EstimatorName
@@ -29,7 +30,10 @@ from shearloop.tools.recordings.frames import read_recording
 
 @dataclass(frozen=True, slots=True)
 class CalibrationResult:
-    """A calibration, the number of frames behind it, the load cell's timing, named doubts about it, and the tools."""
+    """A calibration, the load cell's timing, named doubts about it, and the tools.
+
+    `frames` counts those with a known torque or diameter.
+    """
 
     calibration: Calibration
     frames: int
@@ -102,7 +106,8 @@ def calibrate(
     begun = time.perf_counter()
     calibration = fit(estimator, read.parts, source, physics, timing=read.timing)
     fit_s = time.perf_counter() - begun
-    frames = sum(len(part.t_s) for part in read.parts)
+    known = [np.isfinite(part.torque_at_frames()) | np.isfinite(part.diameter_mm) for part in read.parts]
+    frames = sum(int(part.sum()) for part in known)
     tools = distinct([part.tool_mm for part in read.parts if part.tool_mm is not None])
     return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out)
 
@@ -211,8 +216,7 @@ def adapt_to_recordings(
     start, stop = time_range
     named = [(str(path), recording) for path in paths for recording in read_series(path, calibration.sides, tool_mm)]
     check_no_copies(named)
-    if others := not_of_tool(named, tool_mm):
-        raise UserError(f"the recordings are not of one tool: left out would be {others[0]}; adapt to one tool")
+    not_of_tool(named, tool_mm)
     series = [recording for _, recording in named]
     # Earlier frames show the session the idle fingertip.
     until = [

@@ -7,8 +7,11 @@ block take part in its fit. Only the load cell's timing is measured on everythin
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
+
+import numpy as np
 
 from shearloop.bank.bank_file import Bank
 from shearloop.bank.errors import CalibrationError
@@ -21,14 +24,13 @@ from shearloop.tools.figures import Figures, figures_by_load, figures_of, no_bet
 from shearloop.tools.frame_series import Series
 from shearloop.tools.left_out_blocks import Block, Kind, after_twists, find_blocks, kept, number_of_grips, tools_of
 from shearloop.tools.parallel import Executor
-from shearloop.words import counted
+from shearloop.words import CountedReasons, counted
 
 # Grips that show how the gain changes from one to the next.
 _ENOUGH_GRIPS = 3
 # A tool that is left out needs three others, which determine the gain over the diameter.
 _ENOUGH_TOOLS = 4
 MEAN_TWIST = "a stopwatch with the mean twist"
-NO_ESTIMATE = "No loaded frame has an estimate: see why with `shearloop evaluate CAL REC`."
 ON_ANOTHER = "Judge it on another recording: `shearloop evaluate CAL REC`."
 # Below this coverage of the 95 % intervals, the advice is more data.
 _MIN_COVERAGE = 0.9
@@ -115,11 +117,9 @@ class LeftOut:
 
     @property
     def not_judged(self) -> list[str]:
-        """Why blocks have no part in the figures, each in one sentence without its point."""
+        """The blocks without a part in the figures, each with the reason."""
         blocks = zip(self.names, self.tracks, strict=True)
-        refused = [
-            f"{name} is not judged: no torque was estimated on it" for name, tracks in blocks if _lacks_torque(tracks)
-        ]
+        refused = [f"{name}, because no torque was estimated on it" for name, tracks in blocks if _lacks_torque(tracks)]
         return [*self.without_rest, *refused]
 
     def figures(self, loaded_nm: float = LOADED_NM) -> dict[str, object]:
@@ -221,7 +221,7 @@ def advice_on(
     judged = [track for block_tracks in tracks for track in block_tracks]
     loaded = figures_by_load(judged)["loaded"]
     if loaded["baseline_ratio"] is None:
-        return NO_ESTIMATE
+        return without_estimate(judged)
     if few_tools := _few_tools(kind, recordings):
         return few_tools
     if kind == "tools" and not adapted:
@@ -232,6 +232,21 @@ def advice_on(
     if against := no_better_than_clock(judged):
         return against
     return advice_of_coverage(judged, kind)
+
+
+def without_estimate(tracks: Sequence[EstimateTrack]) -> str:
+    """Return why left-out tracks cannot be judged: the most frequent reason against their loaded frames."""
+    against = CountedReasons()
+    for track in tracks:
+        loaded = np.abs(track.series.torque_at_frames()) >= LOADED_NM
+        for estimate in compress(track.estimates, loaded):
+            reasons = estimate.reasons or (track.why_no_torque or "the rest gives no torque",)
+            if estimate.torque_nm is None:
+                against.add(reasons[0])
+    if not against.total:
+        return "No left-out frame with an estimate is under load: record twists of a tool."
+    (count, why), *_ = against.most_frequent_first
+    return f"The rest gives too few estimates of the left-out frames: {why} ({count} of {against.total} loaded frames)."
 
 
 def advice_of_coverage(tracks: Sequence[EstimateTrack], kind: str) -> str:
@@ -256,7 +271,7 @@ def sentences_of(result: LeftOut, loaded_nm: float = LOADED_NM) -> list[str]:
         f"Without a sensor: {_milli(loaded['baseline_zero_rmse_nm'])} mN·m for always 0, "
         f"{_milli(loaded['baseline_profile_rmse_nm'])} mN·m for {result.clock}. Ratio to the better: "
         f"{'unknown' if ratio is None else f'{ratio:.2f}'}.",
-        *(f"{why[0].upper()}{why[1:]}." for why in result.not_judged),
+        *(f"Not judged: {why}." for why in result.not_judged),
         *_before_adapting(result, loaded_nm),
         result.advice,
     ]

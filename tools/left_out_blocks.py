@@ -194,7 +194,7 @@ def after_twists(blocks: Sequence[Block], recordings: Sequence[FrameSeries], n_t
             if n_of_grip <= n_twists:
                 which = block.name if len(block.judged) == 1 else f"a recording of {block.name}"
                 not_judged.append(
-                    f"{which} is not judged: its grip has {counted(n_of_grip, 'twist')} (one ends where the load falls "
+                    f"{which}, because its grip has {counted(n_of_grip, 'twist')} (one ends where the load falls "
                     f"below a tenth), and the gain is adapted to {counted(n_twists, 'twist')}"
                 )
                 continue

@@ -208,7 +208,10 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     """Return what the user should know of a calibration."""
     calibration, regressor, timing = result.calibration, result.regressor, result.timing
     outputs, sides = " and ".join(calibration.outputs), " and ".join(calibration.sides)
-    sentences = [f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side."]
+    sentences = [
+        f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side with a "
+        "known torque or diameter."
+    ]
     if regressor is not None and regressor.misses_loads:
         sentences.append(_misses_loads(regressor, calibration))
     if calibration.only_sign:
@@ -226,11 +229,13 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
     sentences += [f"Left out: {omission}." for omission in result.left_out]
     if result.widening is not None:
+        effect = "and the intervals of loaded frames do not allow for it"
+        if result.widening > 1.0:
+            effect = f"so the intervals of loaded frames are {result.widening:.2g} times wider"
         sentences.append(
             "Could not verify the load cell's timestamps: the load changed too few times. They may be "
-            f"{timing.uncertainty_s:.2g} s off, so the intervals of loaded frames are {result.widening:.2g} times "
-            "wider. Record more changes of load, such as ten twists, or confirm the load cell's clock with "
-            "--load-cell-delay-s 0."
+            f"{timing.uncertainty_s:.2g} s off, {effect}. Record more changes of load, such as ten twists, or confirm "
+            "the load cell's clock with --load-cell-delay-s 0."
         )
     if result.tool_mm is not None:
         sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")

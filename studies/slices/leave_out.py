@@ -20,7 +20,7 @@ from shearloop.studies.slices.profile import SliceProfile
 from shearloop.studies.slices.series import SliceSeries, torques_of
 from shearloop.tools.estimate_tracks import EstimateTrack
 from shearloop.tools.figures import figures_by_load
-from shearloop.tools.leave_out import NO_ESTIMATE, Judged, Plan, advice_of_coverage, fit_without
+from shearloop.tools.leave_out import Judged, Plan, advice_of_coverage, fit_without, without_estimate
 from shearloop.tools.left_out_blocks import Block, Span, kept
 from shearloop.words import counted
 
@@ -102,5 +102,5 @@ def _advice(tracks: Sequence[Sequence[EstimateTrack]]) -> str:
     """Return one sentence: what to do first for a better calibration."""
     judged = [track for block_tracks in tracks for track in block_tracks]
     if figures_by_load(judged)["loaded"]["baseline_ratio"] is None:
-        return NO_ESTIMATE
+        return without_estimate(judged)
     return no_better_than_place(judged) or advice_of_coverage(judged, LEVELS)

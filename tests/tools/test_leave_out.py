@@ -194,8 +194,8 @@ def test_a_tool_without_a_torque_is_named():
     diameters = tuple(Estimate(True, (), None, None, None, 12.0, 10.0, 14.0) for _ in refused.estimates)
     without = replace(refused, estimates=diameters, why_no_torque="the tool has 10 mm")
     result = LeftOut("tools", ("the tool of 20 mm", "the tool of 10 mm"), ((judged,), (without,)), "advice", "a clock")
-    assert sentences_of(result)[-2] == "The tool of 10 mm is not judged: no torque was estimated on it."
-    assert result.figures()["not_judged"] == ["the tool of 10 mm is not judged: no torque was estimated on it"]
+    assert sentences_of(result)[-2] == "Not judged: the tool of 10 mm, because no torque was estimated on it."
+    assert result.figures()["not_judged"] == ["the tool of 10 mm, because no torque was estimated on it"]
     assert without.between(3, 10).without_torque == 7
     assert judged.without_torque == 0
 
@@ -240,14 +240,12 @@ def test_a_block_without_a_later_twist_is_named():
     torque_nm[between] = np.maximum(torque_nm[between], 0.3 * torque_nm.max())
     recordings[0] = replace(held, torque_nm=torque_nm)
     names = ["a", "b", "c"]
-    why = (
-        "is not judged: its grip has 1 twist (one ends where the load falls below a tenth), and the gain is adapted to"
-    )
+    why = "because its grip has 1 twist (one ends where the load falls below a tenth), and the gain is adapted to"
     of_twists = after_twists(find_blocks("twists", recordings, names), recordings, 2)
-    assert of_twists.not_judged == [f"twist 1 of a {why} 2 twists"]
+    assert of_twists.not_judged == [f"twist 1 of a, {why} 2 twists"]
     result = plan_left_out("tools", RECIPE, recordings, names, adapt_twists=2).judge(SerialExecutor())
-    assert result.figures()["not_judged"] == [f"the tool of 10 mm {why} 2 twists"]
-    assert f"The tool of 10 mm {why} 2 twists." in sentences_of(result)
+    assert result.figures()["not_judged"] == [f"the tool of 10 mm, {why} 2 twists"]
+    assert f"Not judged: the tool of 10 mm, {why} 2 twists." in sentences_of(result)
 
 
 def test_nothing_remains_after_as_many_twists_as_there_are():

@@ -99,8 +99,8 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     assert "twist" in mistake("adapt", calibration, recording, "--time-range", "0:0.15", *out)
     ran("calibrate", slices_folder / "torque_slices", "--estimator", "regression", "--out", of_slices)
     assert "calibration of slices" in mistake("adapt", of_slices, recording, *out)
-    said = mistake("adapt", calibration, recording, cylinder("10mm_1"), "--tool-mm", "10", *out)
-    assert "--tool-mm 10, because the recording names its tool, of 30 mm; adapt to one tool" in said
+    several = mistake("adapt", calibration, recording, cylinder("10mm_1"), "--tool-mm", "10", *out)
+    assert "the recordings are of several tools; adapt to one at a time" in several
     copy = tmp_path / "another name.mcap"
     copy.write_bytes(Path(recording).read_bytes())
     assert "give one of the two: a frame that counts twice" in mistake("adapt", calibration, recording, copy, *out)

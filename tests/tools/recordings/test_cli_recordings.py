@@ -335,6 +335,9 @@ def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, 
     assert late == f"The load is {'probably ' if unsure_s else ''}stamped {when} the frames move."
     assert ("widening" in result.figures()) == bool(unsure_s) == bool(sentences)
     assert all("so the intervals of loaded frames are 1.9 times wider. Record more" in one for one in sentences)
+    same = replace(calibration, torque=replace(model, regressor=replace(regressor, timing_widening=1.0)))
+    said = " ".join(sentences_of(replace(result, calibration=same)))
+    assert ("and the intervals of loaded frames do not allow for it. Record more" in said) == bool(unsure_s)
     *_, common, few = sentences_of(replace(result, tools=[Measured(15.0, 0.0), Measured(30.0, 0.0)]))
     assert common == "The tools of 15 and 30 mm have the torque in common."
     assert few == "Diameters are not estimated: that takes recordings of three."

@@ -174,6 +174,12 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
     assert figures_of([estimate_series(of_all_twists, other)])["valid_fraction"] == 0
 
 
+def test_recordings_of_different_fingertips_make_no_calibration(twists, shared, tmp_path):
+    other = imported(tmp_path / "exchanged.mcap", shared / "recordings/streams/20241202_153632")
+    with pytest.raises(CalibrationError, match="recording 2 is of another right fingertip or gel than recording 1"):
+        fit("motion_regression", [twists, other], "two fingertips")
+
+
 def test_a_grip_much_stronger_than_the_calibrated_one_is_refused_and_evaluate_says_so(twists, shared, tmp_path, ran):
     """The stronger grip's gain is off by a factor of 5: 2 % of the intervals would hold the truth."""
     streams = shared / "recordings/streams"

@@ -47,14 +47,13 @@ TAKEN_NAMES = {
 }
 
 
-def _known_transport(address: str) -> str:
+def _known_transport(address: str, info: ValidationInfo) -> str:
+    usual = addresses.usual(str(info.field_name))
     if not address.startswith(("ipc://", "tcp://")):
-        raise ValueError("must be ipc or a tcp address, for this machine only a loopback one: tcp://127.0.0.1:7761")
+        raise ValueError(f"must be ipc or a tcp address, for this machine only a loopback one: {usual}")
     address = addresses.expanded(address)
     if not addresses.has_valid_port(address):
-        raise ValueError(
-            f"must end in a port, a whole number from 1 to {addresses.LARGEST_PORT}, as in tcp://127.0.0.1:7761"
-        )
+        raise ValueError(f"must end in a port, a whole number from 1 to {addresses.LARGEST_PORT}, as in {usual}")
     if addresses.names_localhost(address):
         raise ValueError("names localhost, and a socket is bound to an address: write 127.0.0.1 instead of localhost")
     if (size := addresses.ipc_size(address)) > addresses.LONGEST_IPC:

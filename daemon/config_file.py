@@ -33,15 +33,20 @@ class ConfigModel(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _check_numbers(cls, content: Any) -> Any:
-        # Pydantic takes true for 1, which may be the largest value allowed.
-        for key, value in content.items() if isinstance(content, Mapping) else ():
-            annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
-            needs_number = (_holds(annotation, int) or _holds(annotation, float)) and not _holds(annotation, bool)
-            given = value if isinstance(value, list) else [value]
-            if needs_number and any(isinstance(one, bool) for one in given):
-                raise ValueError(f"{key} is true or false, which YAML also reads from yes and no; write a number")
-        return content
+    def _no_number(cls, content: Any) -> Any:
+        # Pydantic takes true for 1, which may be the largest value allowed, and `true` for no number.
+        if not isinstance(content, Mapping):
+            return content
+        return {key: cls._without_booleans(key, value) for key, value in content.items()}
+
+    @classmethod
+    def _without_booleans(cls, key: Any, value: Any) -> Any:
+        annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
+        if not (_holds(annotation, int) or _holds(annotation, float)) or _holds(annotation, bool):
+            return value
+        if isinstance(value, list):
+            return [_written(one) for one in value]
+        return _written(value)
 
     @field_validator("*")
     @classmethod
@@ -66,6 +71,11 @@ class ConfigModel(BaseModel):
                 yield path, item
                 if isinstance(item, ConfigModel):
                     yield from item.walk(path)
+
+
+def _written(value: object) -> object:
+    """Return true and false as YAML writes them, and any other value as it is."""
+    return str(value).lower() if isinstance(value, bool) else value
 
 
 def _located(value: object, folder: Path) -> object:

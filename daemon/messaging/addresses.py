@@ -86,11 +86,16 @@ def probe(path: str) -> int:
     return 0 if error == errno.EAGAIN else error
 
 
+def usual(key: str) -> str:
+    """Return the usual address of `commands`, or of `publish`."""
+    return COMMAND_ADDRESS if key == "commands" else PUBLISH_ADDRESS
+
+
 def network_refusal(address: str, key: str) -> str:
     """Return the error for a network address without keys; `key` is its key in the configuration."""
     return (
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
-        "tcp://127.0.0.1:7761, or add `curve` with keys from `sudo shearloop keys server`"
+        f"{usual(key)}, or add `curve` with keys from `sudo shearloop keys server`"
     )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import zmq
 
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, is_local, network_refusal, probe, usual
 from shearloop.errors import UserError
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def bind(bound: "zmq.Socket[Any]", address: str, setting: str, keys: "KeyPair | 
         if not has_valid_port(address):
             raise UserError(
                 f"`{setting}: {address}` has no valid port (a whole number from 1 to {LARGEST_PORT}); "
-                "use e.g. tcp://127.0.0.1:7761"
+                f"use e.g. {usual(setting)}"
             )
         _check_ipc_path(address, setting)
         bound.setsockopt(zmq.ZAP_DOMAIN, ZAP_DOMAIN.encode())

@@ -195,6 +195,8 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "
     elif kind == "union_tag_invalid":
         sentence = f"{shown(found)} does not exist"
     else:
+        if found in ("true", "false") and kind.startswith(("float_", "int_")):
+            return "is true or false, which YAML also reads from yes and no; write a number"
         wrong = (words for begin, words in _WRONG if kind.startswith(begin))
         sentence = f"{shown(found)} {next(wrong, details['msg'])}"
     if isinstance(found, str) and _DECIMAL_COMMA.fullmatch(found) and kind.startswith(("float_", "int_")):

@@ -42,6 +42,23 @@ def test_a_boolean_is_refused_where_a_number_is_expected(section, written, tmp_p
     assert "is true or false, which YAML also reads from yes and no; write a number" in said
 
 
+def test_a_boolean_for_a_number_hides_no_other_mistake(tmp_path):
+    said = refusal(tmp_path, "load_cell: {device: {path: port}, rate_hz: 10}\nloop:\n  kp: yes\n  kq: 1\n  ki: -1\n")
+    assert [line.rpartition("config.yaml:")[2].split(": ")[:2] for line in said.splitlines()] == [
+        ["3", "loop.kp"], ["4", "loop.kq"], ["5", "loop.ki"],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("key", ["publish", "commands"])
+@pytest.mark.parametrize("written", ["127.0.0.1:7762", "tcp://127.0.0.1:77620", "tcp://*:7762"])
+def test_an_address_is_mended_by_the_one_that_is_named(key, written, tmp_path):
+    said = refusal(tmp_path, f"load_cell: {{device: {{path: port}}}}\n{key}: {written}\n")
+    (named,) = re.findall(r"tcp://127\.0\.0\.1:\d+", said.replace(f": {written}", ""))
+    path = tmp_path / "config.yaml"
+    path.write_text(f"load_cell: {{device: {{path: port}}}}\n{key}: {named}\n")
+    assert getattr(load_daemon_config(path), key) == named
+
+
 @pytest.mark.parametrize("written", ["no", "on", "True"])
 def test_a_name_without_quotes_is_quoted_as_it_was_written(written, tmp_path):
     said = refusal(tmp_path, f"fingertips:\n  right: {{device: {PORT}}}\n  {written}: {{device: {PORT}}}\n")

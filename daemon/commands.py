@@ -241,7 +241,7 @@ class Commands:
         if not request.get("confirmed"):
             raise CommandRefusedError(f"{sentence}; confirm it with `shearloop command release --yes`")
         _refuse_if_changed(question, sentence, request)
-        _refuse_if(await rig.runner.release())
+        _refuse_if(await rig.runner.release(self._deadline(request)))
         # A daemon that is killed after the answer must not leave the grip that is gone.
         await rig.memory.save_present()
         return {}

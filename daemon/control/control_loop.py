@@ -108,6 +108,7 @@ class ControlLoop:
         kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values()))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor(patience)
+        self.patience = patience
         self.experiment: Experiment | None = None
         # The diameter that the latest experiment states, while it runs and as long as the gripper may hold its tool. It
         # is kept across a restart.

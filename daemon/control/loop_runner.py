@@ -11,7 +11,7 @@ from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
+from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_HANG_S, LONGEST_TICK_S
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
@@ -296,6 +296,18 @@ class ControlLoopRunner:
         self._control_loop.acknowledge()
         return None
 
+    def fingers_refusal(self) -> str | None:
+        """Return why the fingers may not begin to move now, or None.
+
+        Where the daemon stood still, the person who asked for the motion may stand at the robot by now.
+        """
+        if (reason := self.operator_action.why_too_late()) is not None:
+            return reason
+        stood_s = (self._clock.now_ns() - self._decided_ns) / 1e9
+        if not self._running or stood_s <= LONGEST_REST_S + self._control_loop.patience * LONGEST_HANG_S:
+            return None
+        return f"the daemon stood still for {stood_s:.1f} s: look at the rig, and send the command again"
+
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper now, or None.
 
@@ -308,12 +320,15 @@ class ControlLoopRunner:
             return "the arm is moving; wait until it stands still, or stop it"
         return self._control_loop.operator.release_refusal()
 
-    async def release(self) -> str | None:
-        """Open the gripper on the operator's confirmed command; return None, or why not."""
+    async def release(self, deadline: Deadline = NO_DEADLINE) -> str | None:
+        """Open the gripper on the operator's confirmed command; return None, or why not.
+
+        `deadline` is checked as the fingers begin to move.
+        """
         if (reason := self.release_refusal()) is not None:
             return reason
         try:
-            await self.operator_action.release()
+            await self.operator_action.release(deadline)
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.tool.on_release_ended()

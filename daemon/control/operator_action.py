@@ -8,6 +8,7 @@ from typing import Any
 
 from shearloop.daemon.control.command_sender import raise_if_refused
 from shearloop.daemon.control.fingers import Fingers
+from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
@@ -23,6 +24,8 @@ class OperatorAction:
     robot: UrRobot
     fingers: Fingers
     _task: asyncio.Task[None] | None = None
+    # Until when the fingers may begin to move.
+    _deadline: Deadline = NO_DEADLINE
 
     @property
     def under_way(self) -> bool:
@@ -36,9 +39,17 @@ class OperatorAction:
         """
         await self._carry_out("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
 
-    async def release(self) -> None:
+    async def release(self, deadline: Deadline) -> None:
         """Open the gripper, if there is one; raises DriverError and ActionError."""
+        self._deadline = deadline
         await self._carry_out("release", "the release", self._release)
+
+    def why_too_late(self) -> str | None:
+        """Return why the fingers may not begin to move any more, or None; what has begun in time may go on."""
+        reason = self._deadline.why_passed("reaching the gripper")
+        if reason is None:
+            self._deadline = NO_DEADLINE
+        return reason
 
     def stop(self) -> str | None:
         """End the action under way, but not the fingers that it moves; return its command's name, or None."""

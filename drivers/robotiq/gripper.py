@@ -62,6 +62,8 @@ class RobotiqGripper:
     calibration: WidthCalibration
     _: KW_ONLY
     poll_s: float = POLL_S
+    # Why no motion may begin now, None where it may; asked right before each request that moves the fingers is sent.
+    refusal: Callable[[], str | None] = lambda: None
     monitor: LinkMonitor = field(default_factory=LinkMonitor)
     connected: bool = field(default=False, init=False)
     latest: messages.GripperState | None = field(default=None, init=False)
@@ -300,8 +302,15 @@ class RobotiqGripper:
         return await self._read()
 
     async def _write(self, request: messages.Request) -> None:
+        moves = isinstance(request, messages.GripperMove) or request is messages.GripperAction.ACTIVATE
+
+        def check() -> None:
+            # Read and lock may have taken any time.
+            if moves and (reason := self.refusal()) is not None:
+                raise messages.GripperRefusedError(reason)
+
         self._note(request)
-        await self._exchange(partial(self.client.write, request))
+        await self._exchange(partial(self.client.write, request, check))
         # A readout may have come before the write.
         self._latest = None
 
@@ -332,6 +341,9 @@ class RobotiqGripper:
             t_ns = time.monotonic_ns()
             try:
                 return await exchange(), t_ns
+            except messages.GripperRefusedError:
+                self._requests.withdraw()
+                raise
             except DriverError as error:
                 if self.connected:
                     self._loss = error

@@ -1,7 +1,7 @@
 """The gripper over its USB adapter: Modbus RTU with pymodbus (manual, "Gripper register mapping")."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
@@ -112,14 +112,15 @@ class ModbusClient:
         self._act_read = readout.act
         return readout
 
-    async def write(self, request: messages.Request) -> None:
-        """Write the command registers; DeviceLostError or ProtocolError.
+    async def write(self, request: messages.Request, check: Callable[[], None] = lambda: None) -> None:
+        """Write the command registers; DeviceLostError or ProtocolError. `check` raises where it may not any more.
 
         Only `ACTIVATE` activates: a gripper that is not active takes a move as a fault, and stays where it is.
         """
         if request not in (messages.GripperAction.RESET, messages.GripperAction.ACTIVATE):
             # It can restart without a loss of the connection.
             await self.read()
+        check()
         command = command_registers(request, self._last, act=self._act_read and self._act_written)
         await self._exchange(command)
         self._act_written = bool(command[0] >> 8 & _ACT)

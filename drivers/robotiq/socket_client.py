@@ -5,6 +5,7 @@ or with `POS ?` when the controller has no value, for example because the grippe
 """
 
 import asyncio
+from collections.abc import Callable
 
 from shearloop.drivers.connection import TcpPort
 from shearloop.drivers.defaults import URCAP_PORT
@@ -165,8 +166,12 @@ class SocketClient:
             await self._get(name)
         return readout_of(self._values)
 
-    async def write(self, request: messages.Request) -> None:
-        """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError."""
+    async def write(self, request: messages.Request, check: Callable[[], None] = lambda: None) -> None:
+        """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError.
+
+        `check` raises where it may not be sent any more.
+        """
+        check()
         for name in changed_by(request):
             self._values.pop(name, None)
         if isinstance(request, messages.GripperMove) and self._values.get("GTO") != 1:

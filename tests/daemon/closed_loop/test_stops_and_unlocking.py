@@ -1,8 +1,12 @@
 """Stops by the robot, the gripper and the pendant over real ports, and what an operator's unlocking does."""
 
+import time
+from typing import Any
+
 import pytest
 
 from shearloop.daemon.control.faults import FaultCode
+from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.fixtures.rigs import SLOW_TWIST, experiment, pendant, running_rig, started
 
 pytestmark = pytest.mark.real_time
@@ -122,3 +126,29 @@ async def test_a_pendant_that_commands_the_gripper_stops_the_twist_and_its_grips
             assert stands["object"] == status
         assert stands["diameter_mm"] == pytest.approx(20.0, abs=1.0)
         assert "its fingers hold something" in (await command("tare", confirmed=True))["reason"]
+
+
+async def test_a_release_from_before_the_daemon_stood_still_opens_nothing(rig_config, tiny_bank, tmp_path, monkeypatch):
+    """It is read in time, and the process stands still before the gripper's answer."""
+    async with running_rig(rig_config, tiny_bank) as (daemon, watcher, _fault, command):
+        await started(watcher, command, experiment(tmp_path))
+        await watcher.until("loop.state", lambda state: state["phase"] == "done")
+        await watcher.next("gripper.state", watcher.count("gripper.state"))
+        held = watcher.seen["gripper.state"][-1]
+        read = SocketClient.read
+
+        async def read_late(client: SocketClient, **given: Any) -> Any:
+            monkeypatch.setattr(SocketClient, "read", read)
+            time.sleep(1.0)  # noqa: ASYNC251 - the process stands still
+            return await read(client, **given)
+
+        monkeypatch.setattr(SocketClient, "read", read_late)
+        until_ns = daemon.commands.now_ns() + 500_000_000
+        reply = await command("release", confirmed=True, until_ns=until_ns)
+        assert not reply["ok"], reply
+        assert "the request had expired" in reply["reason"]
+        for _ in range(5):
+            await watcher.next("gripper.state", watcher.count("gripper.state"))
+            assert watcher.seen["gripper.state"][-1]["width_mm"] == held["width_mm"]
+        assert (await command("release", confirmed=True))["ok"]
+        await watcher.until("gripper.state", lambda state: state["width_mm"] > held["width_mm"] + 20)

@@ -10,9 +10,10 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
-from tests.daemon.control.cell import TWIST, Cell, driven
+from tests.daemon.control.cell import TWIST, Cell, Gripper, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 
@@ -153,3 +154,34 @@ async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkey
             cell.robot.cycle(read=False)
         await cell.cycles(1)
         assert decided == [cell.state.read_ns]
+
+
+async def test_no_fingers_begin_to_move_after_the_loop_stood_still():
+    async with driven() as cell:
+        assert cell.runner.fingers_refusal() is None
+        cell.robot.bench.now_ns += 5_000_000_000
+        assert "the daemon stood still for 5.0 s" in cell.runner.fingers_refusal()
+        await cell.cycles(2)
+        assert cell.runner.fingers_refusal() is None
+
+
+@pytest.mark.parametrize(
+    ("times_s", "said"),
+    [
+        ((0.5, 1.5), [None, None]),
+        ((1.5, 2.5), ["1.5 s, and the request had expired 0.5 s", "2.5 s, and the request had expired 1.5 s"]),
+    ],
+    ids=["in time", "late"],
+)
+async def test_a_release_is_in_time_by_the_beginning_of_its_motion(times_s, said):
+    """An activation takes longer than a click counts."""
+    now_s, found = [0.0], []
+
+    class Opening(Gripper):
+        async def open_by_operator(self) -> None:
+            for now_s[0] in times_s:
+                found.append(cell.runner.fingers_refusal())
+
+    async with driven(cell=Cell(gripper=Opening())) as cell:
+        assert await cell.runner.release(Deadline(10**9, 0, lambda: round(1e9 * now_s[0]))) is None
+    assert [why and why.removeprefix("reaching the gripper took ").partition(" before")[0] for why in found] == said

@@ -132,6 +132,37 @@ async def test_a_move_of_a_gripper_that_has_restarted_activates_nothing(way, tmp
         await _stays(rig)
 
 
+@pytest.mark.parametrize("active", [True, False])
+@WAYS
+async def test_a_request_that_is_not_wanted_any_more_as_it_is_sent_moves_nothing(way, active, tmp_path):
+    """A daemon may stand still at any moment between a command and its last byte."""
+    async with a_rig(way, tmp_path, active=active, connected=True) as rig:
+        before_mm, read = rig.model.width_mm, rig.driver.client.read
+        stood: list[str] = []
+
+        async def read_at_length(*, whole: bool = False) -> messages.Readout:
+            stood.append("the daemon stood still")
+            return await read(whole=whole)
+
+        rig.driver.client.read = read_at_length
+        rig.driver.refusal = lambda: stood[-1] if stood else None
+        motion = rig.driver.move(messages.GripperCommand(0.0)) if active else rig.driver.activate(may_drop=True)
+        await rig.driver.read()
+        with pytest.raises(messages.GripperRefusedError, match="the daemon stood still"):
+            await motion
+        for _ in range(10):
+            state = await rig.driver.read()
+            rig.monotonic_ns()
+        assert (state.moves, state.others_requests, rig.model.width_mm) == (False, 0, before_mm)
+        # A halt is always wanted.
+        await rig.driver.halt()
+        assert rig.driver.connected
+        rig.driver.refusal = lambda: None
+        await rig.driver.activate(may_drop=True)
+        await rig.driver.finish(await rig.driver.move(messages.GripperCommand(30.0)))
+        assert rig.model.width_mm == pytest.approx(30.0, abs=1.0)
+
+
 @WAYS
 async def test_a_halt_right_after_a_reset_activates_nothing(way, tmp_path):
     """The status shows the reset only after the next step."""

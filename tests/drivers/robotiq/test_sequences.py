@@ -42,7 +42,8 @@ class Client:
     async def read(self, **_: bool) -> messages.Readout:
         return self.readouts.pop(0) if len(self.readouts) > 1 else self.readouts[0]
 
-    async def write(self, request: messages.Request) -> None:
+    async def write(self, request: messages.Request, check: Callable[[], None]) -> None:
+        check()
         self.requests.append((request, self.now_ns))
 
 

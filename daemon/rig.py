@@ -359,8 +359,6 @@ def build_rig(
         memory = RigMemory(files, loop, sensors.load_cell, WrenchZero(loop, robot), clock)
         memory.restore()
     runner = ControlLoopRunner(loop, robot, gripper, sensors.tareable, publisher, clock, memory.save_present)
-    if gripper is not None:
-        gripper.gripper.refusal = runner.fingers_refusal
     experiments = ExperimentFiles(config.experiment_folders, config, sources, commissioning, LoadedFiles.of(config))
     fingers: dict[str, Task] = {"gripper": gripper} if gripper is not None else {}
     tasks: dict[str, Task] = {**fingers, "robot": robot, "loop": runner}

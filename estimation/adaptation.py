@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -11,9 +11,11 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.calibration import Calibration
 from shearloop.estimation.estimator import OutputModel, Quantity
-from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.twists import find_twists, first_twists
 from shearloop.estimation.values import Measured
+
+if TYPE_CHECKING:
+    from shearloop.estimation.gain_correction import GainCorrection
 
 # Frames of a grip that can correct its gain: ten minutes.
 _ADAPTED_FRAMES = 1200
@@ -42,7 +44,7 @@ class LoadedFit:
 class Adaptation:
     """A correction of this grip's gain, and the loaded frames that it was made from, before and after it."""
 
-    correction: GainCorrection
+    correction: "GainCorrection"
     before: LoadedFit
     after: LoadedFit
 

@@ -15,7 +15,6 @@ from shearloop.estimation.estimator import Estimator, OutputModel, Quantity
 from shearloop.estimation.estimator_names import estimator_class
 from shearloop.estimation.fingertip_validator import FingertipValidator
 from shearloop.estimation.gain import ToolLaw
-from shearloop.estimation.gain_correction import GainCorrection, adapt_regressor
 from shearloop.estimation.interval_regressor import IntervalRegressor
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES, LearnedFrames
 from shearloop.estimation.ridge import CensoredRidge
@@ -25,6 +24,7 @@ from shearloop.estimation.values import INLINE, Measured, is_another_tool
 if TYPE_CHECKING:
     from shearloop.bank.bank_file import Bank
     from shearloop.estimation.bank_match import BankMatcher
+    from shearloop.estimation.gain_correction import GainCorrection
 
 FORMAT_VERSION = 11
 _FORMAT = Format("estimator calibration", FORMAT_VERSION, estimator_class)
@@ -120,12 +120,15 @@ class Calibration:
 
     def correct_gain(
         self, features: FloatArray, torque_nm: FloatArray, first: BoolArray | None = None
-    ) -> tuple[Self, GainCorrection]:
+    ) -> tuple[Self, "GainCorrection"]:
         """Return the calibration with the gain of each side corrected by (n, d) features of known torques (n,).
 
         `first` (n,) marks frames of the first twist after a grip. Raises CalibrationError as `gain_regressor` does,
         without a load that is large enough to show the gain, and for twists that do not narrow it.
         """
+        # Few runs correct a gain.
+        from shearloop.estimation.gain_correction import adapt_regressor
+
         torque, regressor = self.torque, self.gain_regressor()
         sides = self.estimator.side_of_features(len(regressor.mean_feature))
         adapted, correction = adapt_regressor(regressor, features, torque_nm, sides, first)

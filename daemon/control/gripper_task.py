@@ -46,7 +46,7 @@ LARGEST_ERROR_STDS = 3.0
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class GripperTask:
     """Connects the gripper to publisher and control loop; `diameters` are the fingertips'.
 
@@ -62,6 +62,8 @@ class GripperTask:
     clock: Clock
     measures_diameters: bool = True
     patience: float = 1.0
+    # Why the fingers may not begin to move now, None where they may.
+    refusal: Callable[[], str | None] = lambda: None
     _motion: FingerMotion = field(default_factory=FingerMotion)
 
     async def run(self) -> None:
@@ -78,7 +80,7 @@ class GripperTask:
         """
         with self._motion.commanded(self.clock.now_ns()):
             try:
-                await self.gripper.activate(may_drop=isinstance(target, Opening))
+                await self.gripper.activate(may_drop=isinstance(target, Opening), refusal=self.refusal)
             except GripperTooHotError as error:
                 raise NotBegunError(str(error)) from error
             except GripperInactiveError as error:
@@ -95,7 +97,8 @@ class GripperTask:
                 return
             else:
                 width_mm = self._opening_width(target, state)
-            sent = await self.gripper.move(GripperCommand(width_mm, target.speed_mm_per_s, target.force_n))
+            command = GripperCommand(width_mm, target.speed_mm_per_s, target.force_n)
+            sent = await self.gripper.move(command, self.refusal)
             state = await self.gripper.finish(sent)
         widest_mm = min(width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
@@ -170,7 +173,7 @@ class GripperTask:
             what = f"its fingers are {status.width_mm:.1f} mm apart, and hold something or may hold it"
             raise NotBegunError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
-            await self.gripper.activate(operator_confirmed=True)
+            await self.gripper.activate(operator_confirmed=True, refusal=self.refusal)
         return True
 
     @property

@@ -84,6 +84,8 @@ class ControlLoopRunner:
         # Counts the stops, also while an experiment starts.
         self._stop_count = 0
         self._closed = False
+        if gripper is not None:
+            gripper.refusal = self.fingers_refusal
 
     async def run(self) -> None:
         """Decide on each state until cancelled; the robot stands still afterwards.

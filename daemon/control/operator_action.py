@@ -39,7 +39,7 @@ class OperatorAction:
         """
         await self._carry_out("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
 
-    async def release(self, deadline: Deadline) -> None:
+    async def release(self, deadline: Deadline = NO_DEADLINE) -> None:
         """Open the gripper, if there is one; raises DriverError and ActionError."""
         self._deadline = deadline
         await self._carry_out("release", "the release", self._release)

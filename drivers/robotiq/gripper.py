@@ -27,6 +27,9 @@ T = TypeVar("T")
 # Each of its calls has a deadline; DeviceLostError closes the connection.
 RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 
+# Why a motion is not wanted any more, None where it is.
+Refusal: TypeAlias = Callable[[], str | None]
+
 POLL_S = 0.1
 # Without a readout of `states` for this number of poll periods, a command reads by itself.
 _POLLS_WAITED = 3
@@ -40,6 +43,10 @@ MOTION_DEADLINE_NS = 10_000_000_000
 # The position of standing fingers may waver by this.
 STANDING_COUNTS = 2
 _NO_COMMUNICATION = 9
+
+
+def _always_wanted() -> None:
+    return None
 
 
 class _TimedReadout(NamedTuple):
@@ -62,8 +69,6 @@ class RobotiqGripper:
     calibration: WidthCalibration
     _: KW_ONLY
     poll_s: float = POLL_S
-    # Why no motion may begin now, None where it may; asked right before each request that moves the fingers is sent.
-    refusal: Callable[[], str | None] = lambda: None
     monitor: LinkMonitor = field(default_factory=LinkMonitor)
     connected: bool = field(default=False, init=False)
     latest: messages.GripperState | None = field(default=None, init=False)
@@ -114,13 +119,15 @@ class RobotiqGripper:
         self.latest = self._state(*await self._read())
         return self.latest
 
-    async def activate(self, *, operator_confirmed: bool = False, may_drop: bool = False) -> messages.GripperState:
+    async def activate(
+        self, *, operator_confirmed: bool = False, may_drop: bool = False, refusal: Refusal = _always_wanted
+    ) -> messages.GripperState:
         """Return the state of the active gripper; an inactive gripper opens and closes its fingers once.
 
         An object in the fingers drops then. So an inactive gripper, or one that is too hot, is activated only if an
         object `may_drop`. After a major fault the operator has to confirm that the fingers are clear.
-        `operator_confirmed` activates in any state. Raises GripperFaultError if the activation is refused or fails:
-        GripperInactiveError or GripperTooHotError if the object is the reason.
+        `operator_confirmed` activates in any state. `refusal` is as in `move`. Raises GripperFaultError if the
+        activation is refused or fails: GripperInactiveError or GripperTooHotError if the object is the reason.
         """
         readout, t_ns = await self._recent()
         fault = messages.fault_of(readout.flt)
@@ -146,23 +153,25 @@ class RobotiqGripper:
         resume_ns = time.monotonic_ns() + PAUSE_NS
         await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
-        await self._write(messages.GripperAction.ACTIVATE)
+        await self._write(messages.GripperAction.ACTIVATE, refusal)
         return await self._wait_until(
             _is_active,
             ACTIVATION_DEADLINE_NS,
             "The gripper's activation does not end; clear the fingers and activate it again.",
         )
 
-    async def move(self, command: messages.GripperCommand) -> messages.GripperMove:
+    async def move(self, command: messages.GripperCommand, refusal: Refusal = _always_wanted) -> messages.GripperMove:
         """Start a motion, clipped to the limits, and return it as sent; `finish` waits for its end.
 
-        Raises GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
+        `refusal` is asked as the request is sent: what was read before may have taken any time. Raises
+        GripperRefusedError with its reason, and for a command that is not finite; GripperFaultError when the gripper
+        would not move.
         """
         sent = self.request_of(command)
         readout, _ = await self._recent()
         if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
-        await self._write(sent)
+        await self._write(sent, refusal)
         return sent
 
     async def finish(self, sent: messages.GripperMove) -> messages.GripperState:
@@ -301,12 +310,9 @@ class RobotiqGripper:
                 return self._latest
         return await self._read()
 
-    async def _write(self, request: messages.Request) -> None:
-        moves = isinstance(request, messages.GripperMove) or request is messages.GripperAction.ACTIVATE
-
+    async def _write(self, request: messages.Request, refusal: Refusal = _always_wanted) -> None:
         def check() -> None:
-            # Read and lock may have taken any time.
-            if moves and (reason := self.refusal()) is not None:
+            if (reason := refusal()) is not None:
                 raise messages.GripperRefusedError(reason)
 
         self._note(request)

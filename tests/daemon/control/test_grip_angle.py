@@ -15,6 +15,7 @@ from shearloop.daemon.control.grip import Grip
 from shearloop.daemon.control.operator_view import release_question
 from shearloop.daemon.control.plan import plan_of
 from shearloop.daemon.control.wrench import wrench_source
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.operator_questions import held_note
 from shearloop.daemon.rig_memory import read_memories
 from shearloop.daemon.torques import TorqueSample
@@ -298,7 +299,7 @@ async def test_a_release_is_on_the_disk_before_it_is_answered():
     turn_to_limit(rig)
     await memory.save_present()
 
-    async def release() -> None:
+    async def release(_deadline: Deadline) -> None:
         rig.control_loop.tool.on_release_ended()
 
     subject = SimpleNamespace(

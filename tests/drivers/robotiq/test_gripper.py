@@ -145,11 +145,13 @@ async def test_a_request_that_is_not_wanted_any_more_as_it_is_sent_moves_nothing
             return await read(whole=whole)
 
         rig.driver.client.read = read_at_length
-        rig.driver.refusal = lambda: stood[-1] if stood else None
-        motion = rig.driver.move(messages.GripperCommand(0.0)) if active else rig.driver.activate(may_drop=True)
-        await rig.driver.read()
+
+        def refusal() -> str | None:
+            return stood[-1] if stood else None
+
+        closing = messages.GripperCommand(0.0)
         with pytest.raises(messages.GripperRefusedError, match="the daemon stood still"):
-            await motion
+            await (rig.driver.move(closing, refusal) if active else rig.driver.activate(may_drop=True, refusal=refusal))
         for _ in range(10):
             state = await rig.driver.read()
             rig.monotonic_ns()
@@ -157,7 +159,6 @@ async def test_a_request_that_is_not_wanted_any_more_as_it_is_sent_moves_nothing
         # A halt is always wanted.
         await rig.driver.halt()
         assert rig.driver.connected
-        rig.driver.refusal = lambda: None
         await rig.driver.activate(may_drop=True)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(30.0)))
         assert rig.model.width_mm == pytest.approx(30.0, abs=1.0)

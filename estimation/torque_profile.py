@@ -12,6 +12,7 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.estimation.twists import find_twists
+from shearloop.estimation.values import torque_at
 
 if TYPE_CHECKING:
     from shearloop.estimation.series import FrameSeries
@@ -32,7 +33,7 @@ class TorqueProfile:
         """Return the profile of recordings, None without a known torque."""
         offsets = np.arange(-_REACH_S, _REACH_S + _STEP_S / 2, _STEP_S)
         twists = [
-            np.interp(middle + offsets, recording.torque_t_s, recording.torque_nm, left=np.nan, right=np.nan)
+            torque_at(middle + offsets, recording.torque_t_s, recording.torque_nm)
             for recording in recordings
             for middle in _middles(recording)
         ]

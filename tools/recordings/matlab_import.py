@@ -28,7 +28,7 @@ from shearloop.drivers.load_cell import STUCK_AFTER
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
-from shearloop.estimation.values import LARGEST_TORQUE_NM
+from shearloop.estimation.values import LARGEST_TORQUE_NM, LONGEST_LOAD_GAP_S
 from shearloop.files import open_file
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
@@ -54,8 +54,6 @@ _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
 _NEIGHBOURS = 12
-# Four frames. A board gives ten values a second, a loop of the paper's two.
-_LOAD_PAUSE_S = 2.0
 # After a missing frame the stamps are higher by this fraction of a period. A late frame does not count.
 _MIN_MISSING = 0.8
 # Fewer frames after a gap, at the end, may all be late.
@@ -469,7 +467,7 @@ def _missing(side: str, arrivals_ns: Sequence[int]) -> str:
 def _missing_load(stamps_s: FloatArray) -> Iterator[str]:
     """Yield the remark on load values that are missing, where there is one."""
     pauses_s = np.diff(stamps_s)
-    pauses_s = pauses_s[pauses_s > _LOAD_PAUSE_S]
+    pauses_s = pauses_s[pauses_s > LONGEST_LOAD_GAP_S]
     if len(pauses_s):
         yield (
             f"Load values are missing in {counted(len(pauses_s), 'place')}, for up to {pauses_s.max():.1f} s: frames "

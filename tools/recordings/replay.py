@@ -43,7 +43,7 @@ from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from shearloop.errors import UserError
-from shearloop.estimation import BeforeFrame, HeldTool, Session
+from shearloop.estimation import BeforeFrame, HeldTool, Measured, Session
 from shearloop.models import validated
 from shearloop.tools.recordings.before_frame import SESSION_KINDS, before_frame
 from shearloop.tools.recordings.reader import OpenRecording, open_recording, reading
@@ -187,6 +187,15 @@ class RecordedRun:
         """Whether it holds raw input; an imported recording holds only lines."""
         return any(topic.startswith(schema.input_topic("")) and topic != schema.CLOCK_TOPIC for topic in self.counts)
 
+    @property
+    def tool(self) -> Measured | None:
+        """The tool that an imported recording names; a daemon's recording holds what was held at each time."""
+        named_mm = self.metadata.get(schema.DIAMETER_NOTE)
+        if named_mm is None or self.has_inputs:
+            return None
+        with reading(self.path):
+            return Measured(float(named_mm), 0.0)
+
     def continues_with(self, config: DaemonConfig) -> bool:
         """Whether its states fit: they are of the same code, and of the recorded configuration."""
         return bool(self.continued) and config is self._own and self.metadata.get("code_sha256") == schema.code_digest()
@@ -239,11 +248,13 @@ class RecordedRun:
         with open_recording(self.path) as recording:
             # An imported recording has one side after the other, a live one is in order.
             recorded = recording.messages(self._columns, by_time=not self.has_inputs)
-            for number, (channel, message) in enumerate(recorded):
+            imported: Counter[str] = Counter()
+            for channel, message in recorded:
                 columns = self._columns[channel.topic]
                 content = columns.known(recording.content(channel, message))
                 if schema.schema_name(channel.topic) in schema.IMPORTED_KEYS and "source" not in content:
-                    yield _imported_event(channel.topic, content, message.log_time, number)
+                    yield _imported_event(channel.topic, content, message.log_time, imported[channel.topic])
+                    imported[channel.topic] += 1
                 else:
                     yield _live_event(channel.topic, content, columns.unusable)
 
@@ -403,6 +414,10 @@ class Replay:
         self._sessions: dict[str, Session] = {
             name: open_session(fingertip, name) for name, fingertip in config.fingertips.items()
         }
+        if config.combined is not None:
+            self._sessions[COMBINED] = open_combined(config.combined, config.fingertips)
+        for session in self._sessions.values() if run.tool is not None else ():
+            session.set_tool(run.tool)
         self._frame_parsers = {
             name: FrameParser(
                 self._sessions[name].calibration.table.zero_slots,
@@ -413,8 +428,7 @@ class Replay:
         }
         self._pairing: FramePairing[Frame] | None = None
         if config.combined is not None:
-            self._sessions[COMBINED] = combined = open_combined(config.combined, config.fingertips)
-            sides = combined.calibration.sides
+            sides = self._sessions[COMBINED].calibration.sides
             self._pairing = FramePairing(sides, config.fingertips[sides[0]].frame_period_s)
         self._load_parser: LoadParser | None = None
         if config.load_cell is not None:

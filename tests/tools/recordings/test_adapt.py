@@ -1,11 +1,15 @@
+import asyncio
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from shearloop.daemon.config import load_daemon_config
 from shearloop.estimation import Calibration
 from shearloop.estimation.learned_frames import UNKNOWN_FRAMES
+from tests.tools.recordings.test_replay import replayed
 
 pytestmark = pytest.mark.usefixtures("unjudged")
 
@@ -108,6 +112,18 @@ def test_what_cannot_be_adapted_is_refused(calibration, cylinder, slices_folder,
     said = mistake("adapt", calibration, recording, "--time-range", "0:0.38", "--out", calibration)
     assert "are the same file or folder: nothing was changed; choose another --out" in said
     assert calibration.read_bytes() == before
+
+
+def test_a_replay_of_an_import_knows_the_tool_and_counts_each_topics_messages(calibration, cylinder, config):
+    fingertip = {"calibration": str(calibration), "bank": None, "frame_period_s": 0.5412}
+    loaded = load_daemon_config(config(right=fingertip, load_cell={"device": {"serial_number": "a"}}))
+    for name, why in (("30mm_2", ""), ("40mm_1", "the tool has 40 mm, and the calibration was made with a tool of 30")):
+        sent, _ = asyncio.run(replayed(Path(cylinder(name)), math.inf, loaded))
+        estimates = [content for topic, content in sent if topic == "eit.estimate"]
+        assert any(one["valid"] for one in estimates) == (not why)
+        assert any(why in one["reason"] for one in estimates)
+        loads = [content["seq"] for topic, content in sent if topic == "load.torque"]
+        assert loads == list(range(len(loads)))
 
 
 @pytest.mark.parametrize(

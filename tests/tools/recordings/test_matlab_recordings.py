@@ -16,6 +16,7 @@ from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.cli import main
 from shearloop.daemon.recorder.writer import new_recording
 from shearloop.errors import UserError
+from shearloop.tools.frame_series import read_series
 from shearloop.tools.recordings import lerobot_export
 from shearloop.tools.recordings.matlab_import import (
     import_mat,
@@ -447,15 +448,22 @@ def test_a_frame_that_was_copied_is_refused(repeats, tmp_path):
         import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap")
 
 
-def test_missing_load_values_are_named(tmp_path):
+@pytest.mark.parametrize("gap_s", [1.5, 18.0])
+def test_missing_load_values_are_named_and_no_torque_is_made_up_there(gap_s, tmp_path):
     seconds = np.arange(0, 60, 0.1)
-    kept = seconds[(seconds < 20) | (seconds > 38)]
+    kept = seconds[(seconds < 20) | (seconds > 20 + gap_s)]
     frames = stream_table(110, 1024)
-    savemat(tmp_path / "device.mat", {"Right_Data": np.column_stack([frames[:, 0], 0.5 * np.ones((110, 1024))])})
+    frames[:, 1:] = np.random.default_rng(0).uniform(0.1, 0.5, (110, 1024))
+    savemat(tmp_path / "device.mat", {"Right_Data": frames})
     savemat(tmp_path / "load.mat", {"Load_Data": np.column_stack([DATENUM + kept / 86400, np.sin(kept)])})
     result = import_mat([tmp_path / "device.mat", tmp_path / "load.mat"], tmp_path / "a.mcap")
-    missing = [one for one in result.remarks if one.startswith("Load values are missing in 1 place, for up to 18.")]
-    assert len(missing) == 1
+    begins = f"Load values are missing in 1 place, for up to {int(gap_s)}."
+    assert len([one for one in result.remarks if one.startswith(begins)]) == 1
+    (series,) = read_series(tmp_path / "a.mcap")
+    since_s = series.t_s - series.torque_t_s[0]
+    silent = (since_s > 19.95) & (since_s < 20.05 + gap_s)
+    assert silent.sum() >= 2
+    assert not np.isfinite(series.torque_at_frames()[silent]).any()
 
 
 def test_times_without_a_date_count_from_the_named_one(tmp_path):

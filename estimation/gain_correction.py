@@ -26,6 +26,8 @@ _BY_CHANCE = 2.0
 _MIN_ZERO, _MIN_CHANGE = 1e-6, 1e-3
 # A correction that leaves more than this fraction of the spread carries no information.
 _MAX_LEFT = 0.95
+# The known torques are the corrected ones within this factor: a fingertip whose gain drifts left 5, a wrong unit 30.
+_MOST_LEFT = 10.0
 # Damping of the first step, the maximum of steps, and the square of a step, in standard errors, that changes nothing.
 _FIRST_DAMPING, _MAX_STEPS, _SETTLED = 1e-3, 200, 1e-12
 
@@ -60,7 +62,7 @@ def adapt_regressor(
     """Return a torque's regressor with each side's gain corrected by (n, d) features of known torques (n,).
 
     `sides` (d,) is the side of each feature, `first` (n,) marks frames of the first twist after a grip. Raises
-    CalibrationError without a load that is large enough to show the gain.
+    CalibrationError without a load that is large enough to show the gain, and for torques far from the corrected ones.
     """
     point = regressor.point
     least_nm = LOADED_FRACTION * max(abs(regressor.range.low), abs(regressor.range.high))
@@ -78,6 +80,15 @@ def adapt_regressor(
         regressor.gain, parts, sign * torque_nm, twists, first=first, bounded=isinstance(point, CensoredRidge)
     )
     factors, loaded = correction.factors, np.concatenate(twists)
+    known_nm, corrected_nm = sign * torque_nm[loaded], parts[loaded] @ factors + correction.offset_nm
+    if isinstance(point, CensoredRidge):
+        corrected_nm = np.maximum(corrected_nm, 0.0)
+    left = float(np.abs(known_nm).sum() / max(float((corrected_nm * np.sign(known_nm)).sum()), _MIN_ZERO))
+    if not 1.0 / _MOST_LEFT <= left <= _MOST_LEFT:
+        raise CalibrationError(
+            f"the known torques are {left:.2g} times the corrected estimates, and no grip changes the gain as much: "
+            "look at the unit and the lever of the load cell, and whether this is the calibration's tool"
+        )
     # Torques of both directions would cancel in a sum.
     before = parts[loaded].sum(axis=1)
     total = float(parts[loaded] @ factors @ before / (before @ before))

@@ -24,7 +24,8 @@ from shearloop.daemon.recorder.writer import new_recording
 from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
 from shearloop.drivers.eit_kit import ADC_REFERENCE_V
 from shearloop.drivers.frame_clock import slope_below
-from shearloop.drivers.load_cell import STUCK_AFTER
+from shearloop.drivers.load_cell import SLEW_NM_PER_S, STUCK_AFTER
+from shearloop.drivers.serial_sensor import StepFilter
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
@@ -40,6 +41,8 @@ _LINES = ("clipped_data", "clipped_data_hom")
 _EARLIEST_S, _LATEST_S = 946_684_800.0, 2_840_140_800.0
 # A line that is stamped late may seem to come after the next one.
 _LARGEST_DELAY_S = 2.0
+# Times that fall back by less are late stamps.
+_LEAST_SET_BACK_S = 0.5
 _LONGEST_ELAPSED_S = 31 * 86_400.0
 # Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
@@ -160,6 +163,21 @@ def _fits(times: FloatArray, time_format: str, shortest_s: float) -> bool:
     return len(t_s) == 1 or shortest_s <= float(np.median(np.diff(t_s))) <= _LONGEST_STEP_S
 
 
+def _set_back(steps_s: FloatArray) -> int | None:
+    """Return the step (n,) at which the clock was set back, None without one.
+
+    A single late time is made up for by the next step. A clock that was set back stays behind.
+    """
+    if not len(steps_s):
+        return None
+    usual_s = float(np.median(steps_s))
+    lost_s = usual_s - steps_s
+    next_s = np.append(steps_s[1:], usual_s)
+    stays = (steps_s < 0) & (lost_s > _LEAST_SET_BACK_S) & (steps_s + next_s < usual_s)
+    found = np.flatnonzero(stays | (steps_s < -_LARGEST_DELAY_S))
+    return int(found[0]) if len(found) else None
+
+
 def _check_times(path: Path, times: FloatArray, time_format: str, shortest_s: float) -> None:
     """Raise UserError, with the finding and the cure, unless times (n,) are of the format and do not fall."""
     steps = np.diff(times)
@@ -171,10 +189,9 @@ def _check_times(path: Path, times: FloatArray, time_format: str, shortest_s: fl
             raise UserError(
                 f"{path}: {fallen} rows are before the row above them, row {first} first: sort the rows by their times"
             )
-        if len(steps_s) and steps_s.min() < -_LARGEST_DELAY_S:
-            row = int(np.argmin(steps_s)) + 2
+        if (at := _set_back(steps_s)) is not None:
             raise UserError(
-                f"{path}: the time in row {row} is {-steps_s.min():.1f} s before that of row {row - 1}: the clock was "
+                f"{path}: the time in row {at + 2} is {-steps_s[at]:.1f} s before that of row {at + 1}: the clock was "
                 "set back; import the rows before and after as two recordings"
             )
         return
@@ -545,7 +562,23 @@ def _valid_load(load: Stream, remarks: list[str]) -> Stream:
         remarks.append(f"{left_out} left out that stood {stuck_after} times or more in a row: no load cell does that.")
         valid &= ~stuck
     order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
+    spikes = np.array(_spikes(load.unix_s[order], torque_nm[order], period_s), dtype=np.bool_)
+    if spikes.any():
+        left_out = counted(int(np.count_nonzero(spikes)), "load value")
+        remarks.append(f"{left_out} left out that jump by more than {SLEW_NM_PER_S:g} N·m/s: spikes of a damaged line.")
+        order = order[~spikes]
     return Stream(load.unix_s[order], load.values[order])
+
+
+def _spikes(unix_s: FloatArray, torque_nm: FloatArray, period_s: float) -> list[bool]:
+    """Return which values (n,) by rising time are spikes, as the daemon judges them."""
+    levels = StepFilter[tuple[float, float]]()
+
+    def is_reachable(before: tuple[float, float], after: tuple[float, float]) -> bool:
+        (before_s, before_nm), (after_s, after_nm) = before, after
+        return abs(after_nm - before_nm) <= SLEW_NM_PER_S * max(after_s - before_s, period_s)
+
+    return [levels.is_spike(value, is_reachable) for value in zip(unix_s.tolist(), torque_nm.tolist(), strict=True)]
 
 
 def _is_one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:

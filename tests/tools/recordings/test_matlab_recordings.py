@@ -15,6 +15,7 @@ from scipy.io import loadmat, savemat
 from shearloop.bank.matlab_file import MatFileError, read_variables
 from shearloop.cli import main
 from shearloop.daemon.recorder.writer import new_recording
+from shearloop.drivers.serial_sensor import SETTLE_VALUES
 from shearloop.errors import UserError
 from shearloop.tools.frame_series import read_series
 from shearloop.tools.recordings import lerobot_export
@@ -315,6 +316,10 @@ def test_times_in_single_precision_are_refused(tmp_path, form):
             WRITTEN["datenum"](np.array([0, 0.5, 1.0, -4.0, -3.5])),
             "the time in row 4 is 5.0 s before that of row 3: the clock was set back",
         ),
+        (
+            WRITTEN["datenum"](0.54 * np.arange(40) - (np.arange(40) >= 20)),
+            "the time in row 21 is 0.5 s before that of row 20: the clock was set back",
+        ),
         (np.full(9, WRITTEN["unix"](0.3)), "every row has the time .*: write the time of each row"),
         (np.zeros(9), "every row has the time 0: write the time of each row"),
         (np.repeat(WRITTEN["unix"](np.arange(3.0)), 4), "12 rows have 3 different times; save the times again"),
@@ -446,6 +451,22 @@ def test_a_frame_that_was_copied_is_refused(repeats, tmp_path):
         UserError, match=rf"right\.mat: row 22 is a copy of the row above, .* \({number} in all\): remove"
     ):
         import_mat([tmp_path / "right.mat"], tmp_path / "a.mcap")
+
+
+def test_spikes_of_the_load_cell_are_left_out_and_counted(tmp_path):
+    """A real step to another torque is none, but for the values that the daemon needs to know it."""
+    seconds = np.arange(0, 60, 0.1)
+    torque_nm = np.where(seconds < 30, 0.0, 0.4) + np.random.default_rng(1).normal(0.0, 1e-3, len(seconds))
+    torque_nm[50::97] = 5.0
+    rows = stream_table(110, 1024)
+    rows[:, 1:] = np.random.default_rng(0).uniform(0.1, 0.5, (110, 1024))
+    savemat(tmp_path / "device.mat", {"Right_Data": rows})
+    savemat(tmp_path / "load.mat", {"Load_Data": np.column_stack([DATENUM + seconds / 86400, torque_nm])})
+    result = import_mat([tmp_path / "device.mat", tmp_path / "load.mat"], tmp_path / "a.mcap")
+    count = len(torque_nm[50::97]) + SETTLE_VALUES - 1
+    assert f"{count} load values left out that jump by more than 2 N·m/s: spikes of a damaged line." in result.remarks
+    (series,) = read_series(tmp_path / "a.mcap")
+    assert set(np.round(series.torque_nm, 1)) == {0.0, 0.4}
 
 
 @pytest.mark.parametrize("gap_s", [1.5, 18.0])

@@ -82,6 +82,8 @@ class Session:
         self._matcher = matcher or calibration.matcher(bank)
         # Why the held tool leaves no torque, though there may be a diameter; empty where it does not.
         self.why_no_torque = ""
+        # Whether the gripper holds something, as far as it says.
+        self._gripper_holds = False
         self._gain = GripGain()
         self.set_tool(None)
         self.reset()
@@ -97,6 +99,7 @@ class Session:
         if before.gives_up_tare:
             self.give_up_tare()
         if before.tool is not None:
+            self._gripper_holds = before.tool.measured is not None
             self.set_tool(before.tool.diameter)
             self.why_no_torque = before.tool.conflict or self.why_no_torque
 
@@ -280,7 +283,7 @@ class Session:
         if is_first:
             first = "there is no earlier frame to compare with"
             return ProcessedFrame.refused(usable, self._memory.waits() if self._memory.interrupted else first)
-        if not (self._memory.positions or frame.fingers_moved):
+        if not (self._memory.positions or frame.fingers_moved or self._gripper_holds):
             # Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
             for layer in idle.idle_sides(channels):
                 restored = checks.restore(layer, channels, frame)

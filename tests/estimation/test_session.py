@@ -22,7 +22,7 @@ from shearloop.estimation import (
     fit,
     fitting,
 )
-from shearloop.estimation.fingertip_validator import mask_unmeasured
+from shearloop.estimation.fingertip_validator import FingertipValidator, mask_unmeasured
 from shearloop.estimation.gain import ToolLaw
 from shearloop.estimation.session import FINGERS_MOVED
 from shearloop.estimation.twists import find_twists
@@ -98,6 +98,21 @@ def test_a_session_that_begins_gripped_is_read_from_its_motion(motion_calibratio
     estimates = follow(motion_calibration, later)
     assert np.mean([one.valid for one in estimates[15:]]) > 0.9
     assert judged(estimates, later).r > 0.95
+
+
+@pytest.mark.parametrize("holds", [False, True])
+def test_a_frame_while_the_gripper_holds_something_is_not_idle_though_it_looks_so(
+    motion_calibration, holds, monkeypatch
+):
+    """A daemon that began anew took the held tool for nothing, and named no grip until the next one."""
+    monkeypatch.setattr(FingertipValidator, "looks_idle", lambda *_: True)
+    later, session = twisting(seed=21).between(60, 240), Session(motion_calibration)
+    session.prepare(BeforeFrame(tool=HeldTool(Measured(20.0, 0.5) if holds else None)))
+    estimates = follow(session, later)
+    if holds:
+        assert np.mean([one.valid for one in estimates[15:]]) > 0.9
+    else:
+        assert estimates[20].reasons == ("no grip at the right and left fingertip",)
 
 
 def test_no_idle_frame_is_valid(motion_calibration):

@@ -247,6 +247,8 @@ def why_not_recorded(folder: Path) -> Hint | None:
         read_only = file_system.f_flag & os.ST_RDONLY
         why = os.strerror(errno.EROFS if read_only else errno.EACCES)
         return Hint(f"you may not write in {existing} ({why})", "choose another folder, or make this one writable")
+    if not file_system.f_blocks:
+        return Hint(f"{existing} keeps no files", "choose another folder")
     if not file_system.f_bavail:
         return Hint(f"the disk of {existing} is full", "free some space, or choose another folder")
     return None

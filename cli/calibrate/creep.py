@@ -6,6 +6,7 @@ from pathlib import Path
 from shearloop.cli.calibrations import judges_slices, read_judged
 from shearloop.cli.options import add_json, add_option
 from shearloop.cli.terminal import print_result
+from shearloop.errors import UserError
 from shearloop.words import counted
 
 
@@ -23,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import Bank
     from shearloop.tools.creep import fit_creep, grips_of
     from shearloop.tools.estimate_tracks import estimate_series
-    from shearloop.tools.evaluate import known_data
+    from shearloop.tools.evaluate import known_data, why_nothing_judged
     from shearloop.tools.frame_series import check_no_copies
 
     judges_slices(args.calibration, args.recordings)
@@ -32,6 +33,8 @@ def run(args: argparse.Namespace) -> int:
     bank = Bank.open(args.bank) if args.bank else None
     tracks = [estimate_series(calibration, series, bank) for _, series in named]
     grips = [grip for track in tracks for grip in grips_of(track)]
+    if not grips:
+        raise UserError(f"creep: {why_nothing_judged(tracks)}")
     found = fit_creep(grips)
     doubts = known_data(calibration.learned, tracks, [path for path, _ in named])
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)

@@ -1,5 +1,6 @@
 """The gel's creep: its fit, and `calibrate creep` from recordings of held twists to the configuration's line."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -194,6 +195,13 @@ def test_a_recording_without_held_twists_is_refused(monkeypatch, mistake):
     played(monkeypatch, found)
     said = mistake("calibrate", "creep", "held.mcap", "--calibration", "right.cal")
     assert "too few readings for a fit: 10; hold a twist for a minute" in said
+
+
+def test_another_tool_is_named_instead_of_too_few_readings(monkeypatch, mistake):
+    nothing = replace(track(np.zeros(1109, bool)), why_no_torque="the tool has 40 mm, and the calibration 30 mm")
+    played(monkeypatch, nothing)
+    said = mistake("calibrate", "creep", "held.mcap", "--calibration", "right.cal")
+    assert "creep: no frame has an estimate: the tool has 40 mm, and the calibration 30 mm; give recordings" in said
 
 
 def test_twists_that_are_given_twice_are_refused(monkeypatch, mistake):

@@ -272,18 +272,20 @@ def test_an_experiment_that_check_refuses_is_wrong(config, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("flags", "free", "writable", "part"),
+    ("flags", "blocks", "free", "writable", "part"),
     [
-        (os.ST_RDONLY, 9, False, "you may not write in {folder} (Read-only file system)"),
-        (0, 9, False, "you may not write in {folder} (Permission denied)"),
-        (0, 0, True, "the disk of {folder} is full"),
+        (os.ST_RDONLY, 9, 9, False, "you may not write in {folder} (Read-only file system)"),
+        (0, 9, 9, False, "you may not write in {folder} (Permission denied)"),
+        (0, 9, 0, True, "the disk of {folder} is full"),
+        # As of /proc.
+        (0, 0, 0, True, "{folder} keeps no files"),
     ],
 )
 def test_a_folder_in_which_nothing_can_be_recorded_is_wrong(
-    config, tmp_path, monkeypatch, mistake, flags, free, writable, part
+    config, tmp_path, monkeypatch, mistake, flags, blocks, free, writable, part
 ):
     path = config(recording={"folder": str(tmp_path / "later/recordings")})
-    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=flags, f_bavail=free))
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=flags, f_blocks=blocks, f_bavail=free))
     monkeypatch.setattr(os, "access", lambda *_: writable)
     part = part.format(folder=tmp_path)
     assert f"`recording.folder: {tmp_path}/later/recordings`: {part}" in mistake("check", path)

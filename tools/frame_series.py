@@ -122,6 +122,8 @@ def _period_s(recording: Recording, sides: tuple[str, ...]) -> float:
 def part_of(series: Series, start: float, stop: float) -> Series:
     """Return the frames between two fractions (0 to 1) of a series, in time order; UserError for an empty part."""
     n = len(series.t_s)
+    if not n:
+        raise UserError("it has no frame that all of its sides share; record for longer")
     first, end = round(start * n), round(stop * n)
     if first == end:
         raise UserError(f"none of {n} frames lies between the fractions {start:g} and {stop:g}; use a longer part")

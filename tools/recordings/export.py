@@ -73,7 +73,7 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
             used = {name: topic for topic, name in names.items() if waiting[topic]}
             structs: dict[str, Mapping[str, Any]] = {name: arrays(waiting[topic]) for name, topic in used.items()}
             if used:
-                structs[UNITS_TABLE] = {name: columns[topic].units for name, topic in used.items()}
+                structs[UNITS_TABLE] = {name: _units_of(columns[topic], structs[name]) for name, topic in used.items()}
             target = part(len(written) + 1)
             if written:
                 check_new(target)
@@ -92,6 +92,11 @@ def _export_mat(path: Path, out: Path, topics: list[str], progress: Progress) ->
         if size or not written:
             write()
     return written
+
+
+def _units_of(columns: TopicColumns, written: Collection[str]) -> dict[str, str]:
+    """Return the units of the columns that are written: a recording need not have all of its schema's."""
+    return {key: unit for key, unit in columns.units.items() if key in written}
 
 
 def _struct_names(topics: Iterable[str]) -> dict[str, str]:
@@ -120,10 +125,13 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
         check_overwrite(target, "the units of exported tables", _UNITS_HEAD.encode())
     columns = columns_of_topics(path, topics)
     tables: dict[str, _CsvTable | _ParquetTable] = {}
+    # By topic.
+    written: dict[str, Mapping[str, str]] = {}
     with new_folder(out), ExitStack() as files:
         for topic, content, message in read_messages(path, topics, progress):
             row = row_of(content, message.log_time)
             if topic not in tables:
+                written[topic] = _units_of(columns[topic], row)
                 file = files.enter_context(replace_file(paths[topic]))
                 if form == "csv":
                     tables[topic] = _CsvTable(paths[topic], file, row)
@@ -134,7 +142,7 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
         for table in tables.values():
             table.close()
         if form == "csv":
-            rows = [(topic, *unit) for topic in tables for unit in columns[topic].units.items()]
+            rows = [(topic, *unit) for topic, of_topic in written.items() for unit in of_topic.items()]
             rows += _units_of_others(units[UNITS_TABLE], tables)
             lines = [_UNITS_HEAD, *(",".join(map(_csv_cell, row)) for row in rows)]
             files.enter_context(replace_file(units[UNITS_TABLE])).write(

@@ -3,11 +3,13 @@
 import csv
 import dataclasses
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
-from scipy.io import loadmat
+from scipy.io import loadmat, savemat
 
 import shearloop
 from shearloop.daemon.messaging.messages import TOPICS
@@ -54,6 +56,21 @@ def check_table_units(path: Path, out: Path, expected: Units, ran: Callable[...,
         struct = structs[topic.replace(".", "_").replace("-", "_")]
         assert {key: str(struct[key]) for key in struct.dtype.names} == units
         assert read.units(topic) == units
+
+
+def test_units_are_of_the_columns_that_an_imported_recording_has(tmp_path, ran):
+    seconds = 0.54 * np.arange(30)
+    volts = np.random.default_rng(0).uniform(0.1, 0.5, (30, 1024))
+    savemat(tmp_path / "right.mat", {"Right_Data": np.column_stack([739_000 + seconds / 86400, volts])})
+    ran("recording", "import", "mat", tmp_path / "right.mat", "--out", tmp_path / "a.mcap")
+    ran("recording", "export", tmp_path / "a.mcap", "--out", tmp_path / "x")
+    ran("recording", "export", tmp_path / "a.mcap", "--format", "mat", "--out", tmp_path / "x.mat")
+    structs = loadmat(tmp_path / "x.mat", squeeze_me=True)
+    for topic, units in csv_units(tmp_path / "x/units.csv").items():
+        header = (tmp_path / f"x/{topic}.csv").read_text().partition("\r\n")[0].split(",")
+        assert units.keys() <= {re.sub(r"_\d+$", "", column) for column in header}
+        name = topic.replace(".", "_")
+        assert set(structs["units"][name].item().dtype.names) <= set(structs[name].dtype.names)
 
 
 def test_tables_of_an_earlier_export_keep_their_units(tmp_path, ran):

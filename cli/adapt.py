@@ -6,7 +6,7 @@ from pathlib import Path
 
 from shearloop.cli.calibrations import DELAY_S, load_calibration, time_range
 from shearloop.cli.options import TOOL_MM, add_json, add_option
-from shearloop.cli.output_paths import output_path
+from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import print_result
 from shearloop.tools.outputs import check_overwrite
 from shearloop.words import counted
@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.tools.calibrate import adapt_to_recordings
 
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    replaced = args.out.exists()
     physics = Physics(bank=Bank.open(args.bank) if args.bank else None)
     calibration = load_calibration(args.calibration)
     if not calibration.learned.complete:
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         sentences.append("The deviation may be chance; the gain is unchanged.")
     else:
         sentences.append(f"{counted(correction.twists, 'twist')} of known torque decided.")
-    sentences.append(f"Written to {args.out}.")
+    sentences.append(written_to(args.out, replaced=replaced))
     figures = {
         "path": str(args.out),
         "gains": gains,

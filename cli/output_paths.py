@@ -31,6 +31,11 @@ class OutputPath:
 output_path = OutputPath()
 
 
+def written_to(out: Path, *, replaced: bool) -> str:
+    """Return the sentence on a file that was written, in place of an earlier one or not."""
+    return f"Written to {out}, in place of an earlier file." if replaced else f"Written to {out}."
+
+
 def _name_of(action: argparse.Action) -> str:
     """Return an argument as a person types it."""
     return action.option_strings[-1] if action.option_strings else str(action.metavar)

@@ -267,6 +267,8 @@ def _export(args: argparse.Namespace) -> int:
     from shearloop.tools.recordings.tables import RecordedTopics
 
     path, form = args.recording, args.format
+    if args.fingertip is not None and form != "rrd":
+        raise UserError(f"--fingertip is for --format rrd, which draws profiles of it: leave it out with {form}")
     kind = _SINGLE_FILES.get(form)
     out = _destination(path, args.out, form)
     if kind:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.cli.options import add_action, add_json, add_option, number, run_action
-from shearloop.cli.output_paths import output_path
+from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.plots import require_matplotlib
 from shearloop.cli.terminal import print_result, table
 from shearloop.errors import UserError
@@ -78,6 +78,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         calibration = fit_calibration(recorded, friction=args.friction)
     except CalibrationError as error:
         raise UserError(f"{args.table}: {error}") from error
+    replaced = args.out.exists()
     save_calibration(calibration, args.out)
     source = "fitted" if args.friction is None else "given"
     named = (
@@ -103,7 +104,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"gauge depth outwards from mid-skin    {depth}",
         f"rows fitted                          {calibration.rows}",
         f"rows left out beyond the curve       {calibration.rows_beyond}",
-        f"written: {args.out}",
+        written_to(args.out, replaced=replaced),
     ]
     if side := calibration.missing_side:
         sentences.insert(-1, f"The table has no {side} shear forces, and the skin measures none; record both signs.")

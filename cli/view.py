@@ -38,7 +38,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve the page until SIGINT, SIGTERM or SIGHUP."""
-    return _serve_page(args) if args.foxglove is None else _serve_foxglove(args)
+    if args.foxglove is None:
+        return _serve_page(args)
+    of_page = {
+        "--commands": args.commands != COMMAND_ADDRESS,
+        "--port": args.port != PAGE_PORT,
+        "--fingertip": args.fingertip is not None,
+        "--token-file": args.token_file is not None,
+        "--new-token": args.new_token,
+    }
+    if unused := [option for option, given in of_page.items() if given]:
+        raise UserError(f"{unused[0]} is of the page, and --foxglove serves Foxglove instead of it: leave one out")
+    return _serve_foxglove(args)
 
 
 def _serve_page(args: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.calibrations import check_calibration_file
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option
-from shearloop.cli.output_paths import output_path
+from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.robotiq.models import MODELS
@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
         operator = Operator(stdout_is_for_json=args.json)
         gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator, left))
     calibration = fit_width(gauges, args.model)
+    replaced = args.out.exists()
     save_calibration(args.out, calibration)
     report = {
         "path": str(args.out),
@@ -88,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     sentences = [
         f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm."
         + (f" The width bows by {calibration.bow_mm:+.1f} mm half-way." if calibration.bow_mm else ""),
-        f"Written to {args.out}.",
+        written_to(args.out, replaced=replaced),
     ]
     return print_result(report, sentences, as_json=args.json)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.calibrations import check_calibration_file
 from shearloop.cli.options import add_json, add_option, number
-from shearloop.cli.output_paths import output_path
+from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.drivers.load_cell_calibration import check_masses, fit_levels
 
     check_calibration_file(args.out)
+    replaced = args.out.exists()
     check_masses(args.mass_g)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
         levels = asyncio.run(measure(port, args.mass_g, Operator(stdout_is_for_json=args.json)))
@@ -62,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         "residual_nm": result.residual_nm,
         "remarks": list(result.sentences),
     }
-    return print_result(report, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
+    return print_result(report, [*result.sentences, written_to(args.out, replaced=replaced)], as_json=args.json)
 
 
 async def _read_samples(port: "SerialPort", samples: "asyncio.Queue[LoadSample]") -> None:

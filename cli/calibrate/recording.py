@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.cli.calibrations import add_recipe, check_recipe, of_slices, time_range
 from shearloop.cli.options import add_json, add_option
-from shearloop.cli.output_paths import output_path
+from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import print_result
 from shearloop.errors import UserError
 from shearloop.estimation.estimator_names import DEFAULT
@@ -52,12 +52,13 @@ def run(args: argparse.Namespace) -> int:
 
     check_recipe(args, args.recordings)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    replaced = args.out.exists()
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     made = _calibrate_slices if of_slices(args.recordings) else _calibrate_recordings
     figures, sentences = made(args, physics)
-    sentences.append(f"Written to {args.out}.")
+    sentences.append(written_to(args.out, replaced=replaced))
     return print_result({"path": str(args.out), **figures}, sentences, as_json=args.json)
 
 

@@ -51,6 +51,20 @@ def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, m
     assert there.read_bytes() == MCAP
 
 
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("recording export no.mcap --format csv --fingertip f.yaml", "--fingertip is for --format rrd, which draws"),
+        ("view --foxglove 0 --new-token", "--new-token is of the page, and --foxglove serves Foxglove instead"),
+        ("view --foxglove 0 --port 0", "--port is of the page"),
+        ("view --foxglove 0 --commands ipc://x", "--commands is of the page"),
+        ("view --foxglove 0 --fingertip f.yaml", "--fingertip is of the page"),
+    ],
+)
+def test_an_option_that_would_do_nothing_is_refused(command, said, mistake):
+    assert said in mistake(*command.split())
+
+
 @pytest.mark.parametrize("command", ["recording import mat no.mat", "recording repair no.mcap"])
 def test_no_command_overwrites_a_recording(command, tmp_path, mistake):
     """It cannot be made again."""

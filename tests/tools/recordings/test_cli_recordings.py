@@ -148,7 +148,9 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
     printed = ran("recording", "import", "mat", mat_folder(), "--out", recording).out
     assert "60 frames of the right side, 60 frames of the left side, 355 torques" in printed
-    ran("calibrate", slices_folder / "torque_slices", "--out", calibration)
+    first, second = (ran("calibrate", slices_folder / "torque_slices", "--out", calibration).out for _ in range(2))
+    assert f"Written to {calibration}.\n" in first
+    assert f"Written to {calibration}, in place of an earlier file.\n" in second
     assert "made from slices, and cannot judge raw frames" in mistake("evaluate", calibration, recording)
     assert "--assume-full-range is for slices" in mistake(
         "calibrate", recording, "--assume-full-range", "--out", calibration

@@ -109,6 +109,18 @@ def lock(handle: int, path: Path) -> None:
             raise
 
 
+def near_name(path: Path) -> str:
+    """Return which file was probably meant by a path of none: one beside it with the same ending; empty without one."""
+    from difflib import get_close_matches
+
+    try:
+        names = [] if path.exists() else [one.name for one in path.parent.iterdir() if one.suffix == path.suffix]
+    except OSError:
+        return ""
+    near = get_close_matches(path.name, names, 1)
+    return f"; did you mean {path.with_name(near[0])}?" if near else ""
+
+
 @contextmanager
 def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str, missing: str = "") -> Iterator[None]:
     """Turn every error of the block into `raises`: a foreign or damaged file raises many types of exceptions.
@@ -120,7 +132,8 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
     except raises:
         raise
     except OSError as error:
-        raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{missing}") from error
+        cure = near_name(path) or missing
+        raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{cure}") from error
     except Exception as error:
         detail = " ".join((repr(error) if isinstance(error, KeyError) else str(error) or repr(error)).split())
         raise raises(f"{path}: {damage.replace('{}', detail[:_LONGEST_DETAIL])}") from error

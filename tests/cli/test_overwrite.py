@@ -298,3 +298,27 @@ def test_a_table_of_an_export_is_not_the_recording(imported, tmp_path, mistake):
 def test_a_report_is_not_its_own_page(tmp_path):
     with pytest.raises(UserError, match=r"report\.html is the name of the report's page"):
         earlier_report(tmp_path / "report.html")
+
+
+NAMED = pytest.mark.parametrize(
+    ("command", "ending"),
+    [
+        ("evaluate {} no.mcap", "cal"),
+        ("bank info {}", "bank"),
+        ("recording info {}", "mcap"),
+        ("recording export {}", "mcap"),
+        ("recording repair {} --out x.mcap", "mcap"),
+    ],
+)
+
+
+@NAMED
+def test_a_name_that_no_file_can_have_is_refused_too(command, ending, tmp_path, mistake):
+    assert "File name too long" in mistake(*command.format(tmp_path / f"{300 * 'a'}.{ending}").split())
+
+
+@NAMED
+def test_a_missing_file_with_a_near_name_is_proposed(command, ending, tmp_path, mistake):
+    (tmp_path / f"right.{ending}").write_bytes(b"")
+    said = mistake(*command.format(tmp_path / f"rigth.{ending}").split())
+    assert f"No such file or directory; did you mean {tmp_path}/right.{ending}?" in said

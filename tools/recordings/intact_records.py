@@ -44,7 +44,7 @@ from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from shearloop.errors import UserError
-from shearloop.files import open_file
+from shearloop.files import near_name, open_file
 
 Progress = Callable[[int], None]
 _JOINED = (
@@ -171,7 +171,8 @@ class IntactRecords:
                     raise UserError(f"{self._path}: {_JOINED}")
                 yield from self._records(file)
         except OSError as error:
-            raise UserError(f"{self._path}: the recording cannot be read: {error.strerror or error}") from error
+            why = f"{error.strerror or error}{near_name(self._path)}"
+            raise UserError(f"{self._path}: the recording cannot be read: {why}") from error
 
     def _records(self, file: BinaryIO) -> Iterator[Message | Metadata | Attachment]:
         places = self._use_index(file)

@@ -19,7 +19,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from shearloop.bank.channels import PAPER_TABLE, ChannelTable
 from shearloop.daemon.recorder import schema
 from shearloop.errors import UserError
-from shearloop.files import open_file
+from shearloop.files import near_name, open_file
 from shearloop.tools.recordings.being_written import is_being_written
 from shearloop.tools.recordings.intact_records import (
     LARGEST_RECORD_BYTES,
@@ -150,7 +150,8 @@ def reading(path: Path) -> Iterator[None]:
     except UserError:
         raise
     except OSError as error:
-        raise UserError(f"{path}: the recording cannot be read: {error.strerror or error}") from error
+        why = f"{error.strerror or error}{near_name(path)}"
+        raise UserError(f"{path}: the recording cannot be read: {why}") from error
     except Exception as error:
         detail = str(error) if isinstance(error, McapError | ValueError) and str(error) else repr(error)
         records = IntactRecords(path)

@@ -8,7 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from shearloop.files import expanded_path
+from shearloop.files import expanded_path, is_possible
+from shearloop.words import shown
 
 if TYPE_CHECKING:
     from shearloop.bank.fingertip import Fingertip
@@ -47,7 +48,10 @@ def _number(kind: Callable[[str], float], accepts: Callable[[float], bool], wher
 
 def path_of(text: str) -> Path:
     """Return the path of an option: shells leave `~` in `--out=~/a` as it is, and service files `$HOME`."""
-    return expanded(expanded_path, text)
+    path: Path = expanded(expanded_path, text)
+    if not is_possible(path):
+        raise argparse.ArgumentTypeError(f"{shown(text)} is the name of no file: it is too long, or has a zero byte")
+    return path
 
 
 def expanded(expand: Callable[[str], Expanded], text: str) -> Expanded:

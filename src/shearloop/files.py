@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 _LONGEST_DETAIL = 300
+# Of Linux, in bytes.
+_LONGEST_NAME, _LONGEST_PATH = 255, 4096
 # What file systems answer that cannot flush a folder, and what a folder answers that may be written and not read.
 _NO_FLUSH = (errno.EINVAL, errno.ENOTSUP, errno.EACCES)
 # What file systems answer that have no locks.
@@ -107,6 +109,14 @@ def lock(handle: int, path: Path) -> None:
         # Some network shares have no locks.
         if error.errno not in _NO_LOCKS:
             raise
+
+
+def is_possible(path: Path) -> bool:
+    """Return whether a file of Linux can have a path."""
+    names = [os.fsencode(part) for part in path.parts]
+    return (
+        not any(b"\0" in name or len(name) > _LONGEST_NAME for name in names) and sum(map(len, names)) < _LONGEST_PATH
+    )
 
 
 def near_name(path: Path) -> str:

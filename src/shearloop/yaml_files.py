@@ -13,13 +13,10 @@ from typing import Any, Self
 import yaml
 from pydantic import ValidationError
 
-from shearloop.files import read_file, replace_file
+from shearloop.files import is_possible, read_file, replace_file
 from shearloop.models import Model, as_model
 from shearloop.words import shown
 from shearloop.yaml_loader import MAX_BYTES, Loader
-
-# Of Linux.
-_LONGEST_NAME, _LONGEST_PATH = 255, 4096
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +45,7 @@ class Document:
 
         That message may name another file, one with the keys of `model`.
         """
-        if "\0" in str(path) or len(path.name) > _LONGEST_NAME or len(str(path)) > _LONGEST_PATH:
+        if not is_possible(path):
             raise raises(f"{shown(str(path))}: no {what} has such a name")
         try:
             data = read_file(path, most_bytes)

@@ -43,6 +43,7 @@ _EARLIEST_S, _LATEST_S = 946_684_800.0, 2_840_140_800.0
 _LARGEST_DELAY_S = 2.0
 # Times that fall back by less are late stamps.
 _LEAST_SET_BACK_S = 0.5
+_COMPARED_ROWS = 9
 _LONGEST_ELAPSED_S = 31 * 86_400.0
 # Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
@@ -166,16 +167,17 @@ def _fits(times: FloatArray, time_format: str, shortest_s: float) -> bool:
 def _set_back(steps_s: FloatArray) -> int | None:
     """Return the step (n,) at which the clock was set back, None without one.
 
-    A single late time is made up for by the next step. A clock that was set back stays behind.
+    Late times return to where they would have been. Those of a clock that was set back stay behind.
     """
     if not len(steps_s):
         return None
-    usual_s = float(np.median(steps_s))
-    lost_s = usual_s - steps_s
-    next_s = np.append(steps_s[1:], usual_s)
-    stays = (steps_s < 0) & (lost_s > _LEAST_SET_BACK_S) & (steps_s + next_s < usual_s)
-    found = np.flatnonzero(stays | (steps_s < -_LARGEST_DELAY_S))
-    return int(found[0]) if len(found) else None
+    # How late each row is, against rows at the usual step.
+    late_s = np.concatenate([[0.0], np.cumsum(steps_s - np.median(steps_s))])
+    for at in np.flatnonzero(steps_s < 0).tolist():
+        before_s, after_s = late_s[max(0, at + 1 - _COMPARED_ROWS) : at + 1], late_s[at + 1 : at + 1 + _COMPARED_ROWS]
+        if steps_s[at] < -_LARGEST_DELAY_S or before_s.min() - after_s.max() > _LEAST_SET_BACK_S:
+            return int(at)
+    return None
 
 
 def _check_times(path: Path, times: FloatArray, time_format: str, shortest_s: float) -> None:
@@ -576,7 +578,9 @@ def _spikes(unix_s: FloatArray, torque_nm: FloatArray, period_s: float) -> list[
 
     def is_reachable(before: tuple[float, float], after: tuple[float, float]) -> bool:
         (before_s, before_nm), (after_s, after_nm) = before, after
-        return abs(after_nm - before_nm) <= SLEW_NM_PER_S * max(after_s - before_s, period_s)
+        # A stream that is faster than the cell shows a change between two measurements in one step.
+        elapsed_s = max(after_s - before_s, period_s, 1.0 / LOAD_CELL_RATE_HZ)
+        return abs(after_nm - before_nm) <= SLEW_NM_PER_S * elapsed_s
 
     return [levels.is_spike(value, is_reachable) for value in zip(unix_s.tolist(), torque_nm.tolist(), strict=True)]
 

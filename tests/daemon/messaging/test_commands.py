@@ -27,6 +27,7 @@ from shearloop.daemon.messaging.command_server import (
     CommandServer,
     RequestExecutor,
 )
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.messaging.refusals import Refusals
@@ -290,7 +291,7 @@ async def test_a_command_that_crashes_or_is_cut_off_is_reported_as_not_carried_o
         def release_refusal(self) -> None:
             return None
 
-        async def release(self) -> None:
+        async def release(self, _deadline: Deadline) -> None:
             begun.set()
             await never.wait()
 

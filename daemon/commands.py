@@ -223,7 +223,7 @@ class Commands:
                 reason = f"{sentence}; secure it, then confirm it with `shearloop command unlock --yes`"
                 raise CommandRefusedError(reason, **question.facts)
             _refuse_if_changed(question, sentence, request)
-        _refuse_if(await rig.runner.unlock(confirmed=confirmed))
+        _refuse_if(await rig.runner.unlock(self._deadline(request), confirmed=confirmed))
         return {}
 
     async def _release(self, request: Request) -> Reply:

@@ -20,7 +20,14 @@ from shearloop.daemon.control.experiment_schema import (
     TareStep,
     TurnToStep,
 )
-from shearloop.daemon.control.fault_detection import Grasp, RunningStep, Watched, compared_for_s, detect_faults
+from shearloop.daemon.control.fault_detection import (
+    LONGEST_HANG_S,
+    Grasp,
+    RunningStep,
+    Watched,
+    compared_for_s,
+    detect_faults,
+)
 from shearloop.daemon.control.faults import Fault, FaultCode, Response
 from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
@@ -108,7 +115,6 @@ class ControlLoop:
         kept_s = max(ADAPTED_OVER_S, compared_for_s(sources.values()))
         self.inputs = LatestInputs(kept_s=kept_s, died=dead_tasks)
         self.safety = SafetyMonitor(patience)
-        self.patience = patience
         self.experiment: Experiment | None = None
         # The diameter that the latest experiment states, while it runs and as long as the gripper may hold its tool. It
         # is kept across a restart.
@@ -312,6 +318,11 @@ class ControlLoop:
     def pause(self) -> str | None:
         """Stand still until `resume`; return None, or why not."""
         return self.experiment.pause() if self.experiment is not None else "no experiment is running"
+
+    @property
+    def longest_hang_s(self) -> float:
+        """For how long the loop may decide nothing without a stop that waits for an acknowledgement."""
+        return self._watched.patience * LONGEST_HANG_S
 
     def resume(self) -> str | None:
         """Continue after `pause`; return None, or why not."""

@@ -17,7 +17,7 @@ from shearloop.daemon.messaging.messages import GripperStateMessage
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.gripper import Permit, RobotiqGripper, permitted
 from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
     GripperCommand,
@@ -46,7 +46,7 @@ LARGEST_ERROR_STDS = 3.0
 TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class GripperTask:
     """Connects the gripper to publisher and control loop; `diameters` are the fingertips'.
 
@@ -62,8 +62,6 @@ class GripperTask:
     clock: Clock
     measures_diameters: bool = True
     patience: float = 1.0
-    # Why the fingers may not begin to move now, None where they may.
-    refusal: Callable[[], str | None] = lambda: None
     _motion: FingerMotion = field(default_factory=FingerMotion)
 
     async def run(self) -> None:
@@ -73,14 +71,14 @@ class GripperTask:
                 self._publish(state)
                 self._take(state)
 
-    async def grip(self, target: GripStep) -> None:
+    async def grip(self, target: GripStep, permit: Permit = permitted) -> None:
         """Move to a width and wait for the end; raises DriverError and ActionError.
 
-        A release activates the gripper where that is needed. A grip never does.
+        A release activates the gripper where that is needed. A grip never does. `permit` is as in the driver.
         """
         with self._motion.commanded(self.clock.now_ns()):
             try:
-                await self.gripper.activate(may_drop=isinstance(target, Opening), refusal=self.refusal)
+                await self.gripper.activate(may_drop=isinstance(target, Opening), permit=permit)
             except GripperTooHotError as error:
                 raise NotBegunError(str(error)) from error
             except GripperInactiveError as error:
@@ -98,7 +96,7 @@ class GripperTask:
             else:
                 width_mm = self._opening_width(target, state)
             command = GripperCommand(width_mm, target.speed_mm_per_s, target.force_n)
-            sent = await self.gripper.move(command, self.refusal)
+            sent = await self.gripper.move(command, permit)
             state = await self.gripper.finish(sent)
         widest_mm = min(width_mm, self.gripper.model.stroke_mm)
         # The loop needs the state before the end of the action.
@@ -138,30 +136,30 @@ class GripperTask:
                 f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"
             )
 
-    async def release(self) -> None:
-        """Open wide; raises DriverError and ActionError."""
-        await _tried(lambda: self.grip(OPENING))
+    async def release(self, permit: Permit = permitted) -> None:
+        """Open wide; raises DriverError and ActionError, and what `permit` raises."""
+        await _tried(lambda: self.grip(OPENING, permit))
 
-    async def open_by_operator(self) -> None:
+    async def open_by_operator(self, permit: Permit = permitted) -> None:
         """Open wide, also after a fault, once the operator says that a tool may drop; raises as `release` does."""
-        await self._end_fault(confirmed=True)
-        await self.release()
+        await self._end_fault(permit, confirmed=True)
+        await self.release(permit)
 
     async def halt(self) -> None:
         """Stop the fingers; raises DriverError."""
         with self._motion.commanded(self.clock.now_ns()):
             await _tried(self.gripper.halt)
 
-    async def unlock(self, *, confirmed: bool = False) -> None:
+    async def unlock(self, permit: Permit = permitted, *, confirmed: bool = False) -> None:
         """Activate again after a fault, which opens the fingers; raises DriverError and ActionError.
 
         Where they hold something, or may, it has to be `confirmed` by the operator, else this raises NotBegunError.
         """
-        if await self._end_fault(confirmed=confirmed):
+        if await self._end_fault(permit, confirmed=confirmed):
             # An activation leaves the fingers open. Only a motion shows the gripper whether they hold something.
-            await self.release()
+            await self.release(permit)
 
-    async def _end_fault(self, *, confirmed: bool) -> bool:
+    async def _end_fault(self, permit: Permit, *, confirmed: bool) -> bool:
         """Activate the gripper if it has a fault that needs it; return whether it had one. Raises as `unlock` does."""
         # Read now: the latest state may be older than the fault.
         state = await self.gripper.read()
@@ -173,7 +171,7 @@ class GripperTask:
             what = f"its fingers are {status.width_mm:.1f} mm apart, and hold something or may hold it"
             raise NotBegunError(f"{activation_sentence(what)}; confirm it with `shearloop command unlock --yes`")
         with self._motion.commanded(self.clock.now_ns()):
-            await self.gripper.activate(operator_confirmed=True, refusal=self.refusal)
+            await self.gripper.activate(operator_confirmed=True, permit=permit)
         return True
 
     @property
@@ -275,6 +273,9 @@ async def _tried(act: Callable[[], Awaitable[None]]) -> None:
     while True:
         try:
             return await act()
+        except NotBegunError:
+            # What was not begun for a reason is not begun later by itself.
+            raise
         except (ActionError, DriverError):
             if asyncio.get_running_loop().time() > tries_until_s:
                 raise

@@ -11,12 +11,12 @@ from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop, Drive, End, StandStill
 from shearloop.daemon.control.experiment import Experiment, ExperimentPhase
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_HANG_S, LONGEST_TICK_S
+from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import ArmStatus
-from shearloop.daemon.control.operator_action import UNLOCKING, OperatorAction
+from shearloop.daemon.control.operator_action import UNLOCKING, MotionPermit, OperatorAction
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves
@@ -81,11 +81,12 @@ class ControlLoopRunner:
         # When something that may have been moving ended.
         self._ended_ns: int | None = None
         self._decided_ns = 0
+        # Between two decisions: a longer time is a standstill, of which the latest ended at `_returned_ns`.
+        self._longest_pause_s = LONGEST_REST_S + control_loop.longest_hang_s
+        self._stood_s, self._returned_ns = 0.0, 0
         # Counts the stops, also while an experiment starts.
         self._stop_count = 0
         self._closed = False
-        if gripper is not None:
-            gripper.refusal = self.fingers_refusal
 
     async def run(self) -> None:
         """Decide on each state until cancelled; the robot stands still afterwards.
@@ -279,18 +280,20 @@ class ControlLoopRunner:
         """Return why robot and gripper cannot be unlocked now, or None."""
         return self.busy() or self._control_loop.operator.running_refusal()
 
-    async def unlock(self, *, confirmed: bool = False) -> str | None:
+    async def unlock(self, deadline: Deadline = NO_DEADLINE, *, confirmed: bool = False) -> str | None:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not.
 
-        `confirmed`: the operator says that a tool may drop, where the gripper is activated again.
+        `confirmed`: the operator says that a tool may drop, where the gripper is activated again. `deadline` is checked
+        as the arm or the fingers begin to move.
         """
         if (reason := self.unlock_refusal()) is not None:
             return reason
+        permit = self._permit(deadline)
         # A stop since the latest state is carried out and published as the stop that it is.
         self.decide_now()
         number = self._control_loop.safety.stop_number
         try:
-            await self.operator_action.unlock(confirmed=confirmed)
+            await self.operator_action.unlock(permit, confirmed=confirmed)
         except (ActionError, DriverError) as error:
             return str(error)
         if another := self._control_loop.operator.why_another_stop(number):
@@ -298,15 +301,17 @@ class ControlLoopRunner:
         self._control_loop.acknowledge()
         return None
 
-    def fingers_refusal(self) -> str | None:
-        """Return why the fingers may not begin to move now, or None.
+    def _permit(self, deadline: Deadline) -> MotionPermit:
+        return MotionPermit(deadline, self._clock.now_ns(), self._why_stood_still)
 
-        Where the daemon stood still, the person who asked for the motion may stand at the robot by now.
-        """
-        if (reason := self.operator_action.why_too_late()) is not None:
-            return reason
-        stood_s = (self._clock.now_ns() - self._decided_ns) / 1e9
-        if not self._running or stood_s <= LONGEST_REST_S + self._control_loop.patience * LONGEST_HANG_S:
+    def _why_stood_still(self, since_ns: int) -> str | None:
+        """Return why a person who asked for a motion at `since_ns` may be at the robot by now, or None."""
+        stands_s = (self._clock.now_ns() - self._decided_ns) / 1e9
+        if self._running and stands_s > self._longest_pause_s:
+            stood_s = stands_s
+        elif self._returned_ns > since_ns:
+            stood_s = self._stood_s
+        else:
             return None
         return f"the daemon stood still for {stood_s:.1f} s: look at the rig, and send the command again"
 
@@ -330,7 +335,7 @@ class ControlLoopRunner:
         if (reason := self.release_refusal()) is not None:
             return reason
         try:
-            await self.operator_action.release(deadline)
+            await self.operator_action.release(self._permit(deadline))
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.tool.on_release_ended()
@@ -371,7 +376,10 @@ class ControlLoopRunner:
     def _decide(self) -> None:
         now_ns = self._clock.now_ns()
         # From decision to decision, so that a slow decision is late as well.
-        late_s = (now_ns - self._decided_ns) / 1e9 - (LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S)
+        pause_s = (now_ns - self._decided_ns) / 1e9
+        if pause_s > self._longest_pause_s:
+            self._stood_s, self._returned_ns = pause_s, now_ns
+        late_s = pause_s - (LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S)
         self._decided_ns = now_ns
         sent_rad_per_s = None if self._sender.unanswered else self._sender.sent_rad_per_s
         output = self._control_loop.tick(now_ns, max(0.0, late_s), sent_rad_per_s)

@@ -8,13 +8,34 @@ from typing import Any
 
 from shearloop.daemon.control.command_sender import raise_if_refused
 from shearloop.daemon.control.fingers import Fingers
-from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
-from shearloop.errors import ActionError
+from shearloop.errors import ActionError, NotBegunError
 
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
+
+
+@dataclass(slots=True)
+class MotionPermit:
+    """A person's permission of a motion: until it expires, and as long as the daemon does not stand still.
+
+    A motion that has begun does not expire. `given_ns` is CLOCK_MONOTONIC; `why_stood_still` says whether the daemon
+    stood still since then.
+    """
+
+    deadline: Deadline
+    given_ns: int
+    why_stood_still: Callable[[int], str | None]
+    _taken: bool = False
+
+    def take(self) -> None:
+        """Begin the motion, or go on with it; raises NotBegunError where it is no longer what the person wants."""
+        late = None if self._taken else self.deadline.why_passed("reaching the robot or the gripper")
+        if (reason := late or self.why_stood_still(self.given_ns)) is not None:
+            raise NotBegunError(reason)
+        self._taken = True
 
 
 @dataclass(slots=True)
@@ -24,32 +45,22 @@ class OperatorAction:
     robot: UrRobot
     fingers: Fingers
     _task: asyncio.Task[None] | None = None
-    # Until when the fingers may begin to move.
-    _deadline: Deadline = NO_DEADLINE
 
     @property
     def under_way(self) -> bool:
         """Whether robot and gripper are being unlocked, or the gripper is being opened."""
         return self._task is not None and not self._task.done()
 
-    async def unlock(self, *, confirmed: bool = False) -> None:
+    async def unlock(self, permit: MotionPermit, *, confirmed: bool = False) -> None:
         """Enable robot and gripper; raises DriverError and ActionError.
 
         `confirmed`: the operator says that a tool may drop.
         """
-        await self._carry_out("unlock", "unlocking", partial(self._unlock, confirmed=confirmed))
+        await self._carry_out("unlock", "unlocking", partial(self._unlock, permit, confirmed=confirmed))
 
-    async def release(self, deadline: Deadline = NO_DEADLINE) -> None:
+    async def release(self, permit: MotionPermit) -> None:
         """Open the gripper, if there is one; raises DriverError and ActionError."""
-        self._deadline = deadline
-        await self._carry_out("release", "the release", self._release)
-
-    def why_too_late(self) -> str | None:
-        """Return why the fingers may not begin to move any more, or None; what has begun in time may go on."""
-        reason = self._deadline.why_passed("reaching the gripper")
-        if reason is None:
-            self._deadline = NO_DEADLINE
-        return reason
+        await self._carry_out("release", "the release", partial(self._release, permit))
 
     def stop(self) -> str | None:
         """End the action under way, but not the fingers that it moves; return its command's name, or None."""
@@ -68,7 +79,8 @@ class OperatorAction:
             raise ActionError(f"{name} was stopped; send `{command}` again")
         task.result()
 
-    async def _unlock(self, *, confirmed: bool) -> None:
+    async def _unlock(self, permit: MotionPermit, *, confirmed: bool) -> None:
+        permit.take()
         raise_if_refused(await self.robot.send(Unlock()))
         gripper = self.fingers.gripper
         if gripper is None:
@@ -76,13 +88,13 @@ class OperatorAction:
         try:
             # An activation opens and closes the fingers.
             with self.fingers.moving():
-                await gripper.unlock(confirmed=confirmed)
+                await gripper.unlock(permit.take, confirmed=confirmed)
         except (ActionError, DriverError) as error:
             raise ActionError(f"the robot is unlocked and may move again, and the gripper is not: {error}") from error
 
-    async def _release(self) -> None:
+    async def _release(self, permit: MotionPermit) -> None:
         gripper = self.fingers.gripper
         if gripper is None:
             return
         with self.fingers.moving():
-            await gripper.open_by_operator()
+            await gripper.open_by_operator(permit.take)

@@ -27,8 +27,8 @@ T = TypeVar("T")
 # Each of its calls has a deadline; DeviceLostError closes the connection.
 RobotiqClient: TypeAlias = "SocketClient | ModbusClient"
 
-# Why a motion is not wanted any more, None where it is.
-Refusal: TypeAlias = Callable[[], str | None]
+# It is asked as the last act before a request that moves the fingers, and raises where they may not move any more.
+Permit: TypeAlias = Callable[[], None]
 
 POLL_S = 0.1
 # Without a readout of `states` for this number of poll periods, a command reads by itself.
@@ -45,8 +45,8 @@ STANDING_COUNTS = 2
 _NO_COMMUNICATION = 9
 
 
-def _always_wanted() -> None:
-    return None
+def permitted() -> None:
+    """Permit a motion."""
 
 
 class _TimedReadout(NamedTuple):
@@ -120,13 +120,13 @@ class RobotiqGripper:
         return self.latest
 
     async def activate(
-        self, *, operator_confirmed: bool = False, may_drop: bool = False, refusal: Refusal = _always_wanted
+        self, *, operator_confirmed: bool = False, may_drop: bool = False, permit: Permit = permitted
     ) -> messages.GripperState:
         """Return the state of the active gripper; an inactive gripper opens and closes its fingers once.
 
         An object in the fingers drops then. So an inactive gripper, or one that is too hot, is activated only if an
         object `may_drop`. After a major fault the operator has to confirm that the fingers are clear.
-        `operator_confirmed` activates in any state. `refusal` is as in `move`. Raises GripperFaultError if the
+        `operator_confirmed` activates in any state. `permit` is as in `move`. Raises GripperFaultError if the
         activation is refused or fails: GripperInactiveError or GripperTooHotError if the object is the reason.
         """
         readout, t_ns = await self._recent()
@@ -142,7 +142,8 @@ class RobotiqGripper:
                 return self._state(readout, t_ns)
             if not may_drop:
                 raise messages.GripperInactiveError(blocking)
-        await self._write(messages.GripperAction.RESET)
+        # Both parts of the activation: a reset alone would only hide the fault.
+        await self._write(messages.GripperAction.RESET, permit)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
             lambda now: not now.act and now.sta is messages.ActivationStatus.RESET,
@@ -153,25 +154,24 @@ class RobotiqGripper:
         resume_ns = time.monotonic_ns() + PAUSE_NS
         await self._wait_until(lambda _: time.monotonic_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
         # A rising edge of ACT, which also ends every fault.
-        await self._write(messages.GripperAction.ACTIVATE, refusal)
+        await self._write(messages.GripperAction.ACTIVATE, permit)
         return await self._wait_until(
             _is_active,
             ACTIVATION_DEADLINE_NS,
             "The gripper's activation does not end; clear the fingers and activate it again.",
         )
 
-    async def move(self, command: messages.GripperCommand, refusal: Refusal = _always_wanted) -> messages.GripperMove:
+    async def move(self, command: messages.GripperCommand, permit: Permit = permitted) -> messages.GripperMove:
         """Start a motion, clipped to the limits, and return it as sent; `finish` waits for its end.
 
-        `refusal` is asked as the request is sent: what was read before may have taken any time. Raises
-        GripperRefusedError with its reason, and for a command that is not finite; GripperFaultError when the gripper
-        would not move.
+        `permit` is asked as the request is sent: what was read before may have taken any time. Raises what it raises;
+        GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
         """
         sent = self.request_of(command)
         readout, _ = await self._recent()
         if blocking := blocking_fault(readout):
             raise messages.GripperFaultError(blocking)
-        await self._write(sent, refusal)
+        await self._write(sent, permit)
         return sent
 
     async def finish(self, sent: messages.GripperMove) -> messages.GripperState:
@@ -310,13 +310,12 @@ class RobotiqGripper:
                 return self._latest
         return await self._read()
 
-    async def _write(self, request: messages.Request, refusal: Refusal = _always_wanted) -> None:
-        def check() -> None:
-            if (reason := refusal()) is not None:
-                raise messages.GripperRefusedError(reason)
+    async def _write(self, request: messages.Request, permit: Permit = permitted) -> None:
+        def before() -> None:
+            permit()
+            self._note(request)
 
-        self._note(request)
-        await self._exchange(partial(self.client.write, request, check))
+        await self._exchange(partial(self.client.write, request, before))
         # A readout may have come before the write.
         self._latest = None
 
@@ -347,9 +346,6 @@ class RobotiqGripper:
             t_ns = time.monotonic_ns()
             try:
                 return await exchange(), t_ns
-            except messages.GripperRefusedError:
-                self._requests.withdraw()
-                raise
             except DriverError as error:
                 if self.connected:
                     self._loss = error

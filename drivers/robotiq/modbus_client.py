@@ -112,15 +112,15 @@ class ModbusClient:
         self._act_read = readout.act
         return readout
 
-    async def write(self, request: messages.Request, check: Callable[[], None] = lambda: None) -> None:
-        """Write the command registers; DeviceLostError or ProtocolError. `check` raises where it may not any more.
+    async def write(self, request: messages.Request, before: Callable[[], None] = lambda: None) -> None:
+        """Write the command registers; DeviceLostError or ProtocolError. `before` is called as the last act before.
 
         Only `ACTIVATE` activates: a gripper that is not active takes a move as a fault, and stays where it is.
         """
         if request not in (messages.GripperAction.RESET, messages.GripperAction.ACTIVATE):
             # It can restart without a loss of the connection.
             await self.read()
-        check()
+        before()
         command = command_registers(request, self._last, act=self._act_read and self._act_written)
         await self._exchange(command)
         self._act_written = bool(command[0] >> 8 & _ACT)

@@ -36,10 +36,6 @@ class RequestWatch:
         self.sent, self._sent_ns = None, t_ns
         self._awaits_echo, self._echo = False, None
 
-    def withdraw(self) -> None:
-        """Take back the latest request: it was not sent."""
-        self.sent, self._awaits_echo = None, False
-
     def on_connection(self) -> None:
         """Take a new connection: requests over the earlier connection may have been lost."""
         if self._awaits_echo:

@@ -166,12 +166,12 @@ class SocketClient:
             await self._get(name)
         return readout_of(self._values)
 
-    async def write(self, request: messages.Request, check: Callable[[], None] = lambda: None) -> None:
+    async def write(self, request: messages.Request, before: Callable[[], None] = lambda: None) -> None:
         """Send a request and wait for its acknowledgement; DeviceLostError or ProtocolError.
 
-        `check` raises where it may not be sent any more.
+        `before` is called as the last act before it is sent.
         """
-        check()
+        before()
         for name in changed_by(request):
             self._values.pop(name, None)
         if isinstance(request, messages.GripperMove) and self._values.get("GTO") != 1:

@@ -20,6 +20,7 @@ from shearloop.daemon.control.wrench import publish_every, wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.rig_memory import NoMemory
 from shearloop.daemon.torques import WRENCH, TorqueSample
+from shearloop.drivers.robotiq.gripper import Permit, permitted
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
 from shearloop.drivers.ur.settings import WRENCH_STATES
@@ -147,7 +148,8 @@ class Gripper:
         self.there.set()
         self.asked: list[str] = []
 
-    async def grip(self, _wish: GripStep) -> None:
+    async def grip(self, _wish: GripStep, permit: Permit = permitted) -> None:
+        permit()
         self.asked.append("grip")
         await self.there.wait()
         if self.error is not None:
@@ -159,13 +161,16 @@ class Gripper:
     async def release(self) -> None:
         await self.grip(OPENING)
 
-    async def unlock(self, *, confirmed: bool = False) -> None:
-        self.asked += ["activate"] if confirmed else []
+    async def unlock(self, permit: Permit = permitted, *, confirmed: bool = False) -> None:
+        if confirmed:
+            permit()
+            self.asked.append("activate")
         await self.there.wait()
         if self.unlock_error is not None:
             raise self.unlock_error
 
-    async def open_by_operator(self) -> None:
+    async def open_by_operator(self, permit: Permit = permitted) -> None:
+        permit()
         self.asked.append("open")
         await self.there.wait()
         if self.error is not None:

@@ -20,7 +20,7 @@ from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import GripperStatus
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.gripper import Refusal
+from shearloop.drivers.robotiq.gripper import Permit
 from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
     GripperCommand,
@@ -390,10 +390,10 @@ async def test_fingers_open_after_a_fault_although_a_request_fails_once(way, tmp
         rig.model.fail(12)
         move, losses = rig.driver.move, [DriverError("the gripper did not answer")]
 
-        async def fail_once(request: GripperCommand, refusal: Refusal) -> GripperMove:
+        async def fail_once(request: GripperCommand, permit: Permit) -> GripperMove:
             if losses:
                 raise losses.pop()
-            return await move(request, refusal)
+            return await move(request, permit)
 
         monkeypatch.setattr(rig.driver, "move", fail_once)
         await (task.unlock(confirmed=True) if command == "unlock" else task.open_by_operator())

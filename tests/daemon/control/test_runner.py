@@ -404,7 +404,7 @@ async def test_motion_names_what_moves_until_arm_and_gripper_are_at_rest():
         await cell.cycles(10)
         assert cell.runner.motion() is None
         cell.gripper.there.clear()
-        releasing = asyncio.create_task(cell.runner.operator_action.release())
+        releasing = asyncio.create_task(cell.runner.release())
         await cell.cycles(1)
         assert cell.runner.motion() == "the gripper or the robot is being moved"
         cell.gripper.there.set()

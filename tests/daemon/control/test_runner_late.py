@@ -1,5 +1,7 @@
 """A loop that is late or was away: over the real worker, with an arm and a gripper of this process."""
 
+import asyncio
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 import pytest
@@ -13,7 +15,8 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
-from tests.daemon.control.cell import TWIST, Cell, Gripper, driven
+from shearloop.drivers.robotiq.gripper import Permit, permitted
+from tests.daemon.control.cell import GRIP, TWIST, Cell, Gripper, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 
@@ -156,32 +159,79 @@ async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkey
         assert decided == [cell.state.read_ns]
 
 
-async def test_no_fingers_begin_to_move_after_the_loop_stood_still():
-    async with driven() as cell:
-        assert cell.runner.fingers_refusal() is None
+class Slow(Gripper):
+    """A gripper whose answer takes as long as a test lets time pass; then it moves once or twice."""
+
+    def __init__(self, pass_time: Callable[[int], Awaitable[None]], motions: int = 1) -> None:
+        super().__init__()
+        self._pass_time, self._motions = pass_time, motions
+
+    async def open_by_operator(self, permit: Permit = permitted) -> None:
+        for number in range(self._motions):
+            await self._pass_time(number)
+            await super().open_by_operator(permit)
+
+    async def unlock(self, permit: Permit = permitted, *, confirmed: bool = False) -> None:
+        await self._pass_time(0)
+        await super().unlock(permit, confirmed=confirmed)
+
+
+@pytest.mark.parametrize("decided_since", [False, True])
+@pytest.mark.parametrize("command", ["release", "unlock"])
+async def test_no_fingers_begin_to_move_after_the_daemon_stood_still(command, decided_since):
+    """Also where the loop has decided again before the gripper answers."""
+
+    async def stand_still(_number: int) -> None:
         cell.robot.bench.now_ns += 5_000_000_000
-        assert "the daemon stood still for 5.0 s" in cell.runner.fingers_refusal()
-        await cell.cycles(2)
-        assert cell.runner.fingers_refusal() is None
+        if decided_since:
+            await cell.cycles(2)
+
+    async with driven(cell=Cell(gripper=Slow(stand_still))) as cell:
+        act = cell.runner.release() if command == "release" else cell.runner.unlock(confirmed=True)
+        answered = asyncio.create_task(act)
+        while not answered.done():
+            await cell.cycles(1)
+        assert "the daemon stood still for 5.0 s: look at the rig, and send the command again" in answered.result()
+        assert cell.gripper.asked == []
+        assert not cell.runner.fingers.may_be_moving, "a halt would make the gripper forget what it holds"
+        # The next command is a new one.
+        cell.gripper = cell.runner.fingers.gripper = Gripper()
+        again = asyncio.create_task(cell.runner.release())
+        while not again.done():
+            await cell.cycles(1)
+        assert (again.result(), cell.gripper.asked) == (None, ["open"])
 
 
 @pytest.mark.parametrize(
-    ("times_s", "said"),
+    ("arrives_s", "said", "asked"),
     [
-        ((0.5, 1.5), [None, None]),
-        ((1.5, 2.5), ["1.5 s, and the request had expired 0.5 s", "2.5 s, and the request had expired 1.5 s"]),
+        ((0.5, 1.5), None, ["open", "open"]),
+        ((1.5, 2.5), "reaching the robot or the gripper took 1.5 s, and the request had expired 0.5 s before", []),
     ],
     ids=["in time", "late"],
 )
-async def test_a_release_is_in_time_by_the_beginning_of_its_motion(times_s, said):
+async def test_a_release_is_in_time_by_the_beginning_of_its_motion(arrives_s, said, asked):
     """An activation takes longer than a click counts."""
-    now_s, found = [0.0], []
+    now_s = 0.0
 
-    class Opening(Gripper):
-        async def open_by_operator(self) -> None:
-            for now_s[0] in times_s:
-                found.append(cell.runner.fingers_refusal())
+    async def arrive(number: int) -> None:
+        nonlocal now_s
+        now_s = arrives_s[number]
 
-    async with driven(cell=Cell(gripper=Opening())) as cell:
-        assert await cell.runner.release(Deadline(10**9, 0, lambda: round(1e9 * now_s[0]))) is None
-    assert [why and why.removeprefix("reaching the gripper took ").partition(" before")[0] for why in found] == said
+    async with driven(cell=Cell(gripper=Slow(arrive, motions=2))) as cell:
+        refusal = await cell.runner.release(Deadline(10**9, 0, lambda: round(1e9 * now_s)))
+        assert (refusal and refusal.partition(";")[0], cell.gripper.asked) == (said, asked)
+
+
+async def test_a_release_that_has_nothing_to_do_leaves_no_deadline_behind():
+    """As where the fingers are open: nothing asks for the permit then."""
+
+    class Open(Gripper):
+        async def open_by_operator(self, _permit: Permit = permitted) -> None:
+            self.asked.append("nothing to do")
+
+    async with driven(cell=Cell(gripper=Open())) as cell:
+        assert await cell.runner.release(Deadline(1, 0, lambda: 0)) is None
+        await cell.start(GRIP)
+        await cell.until_done()
+        assert cell.gripper.asked == ["nothing to do", "grip"]

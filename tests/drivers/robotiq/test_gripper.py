@@ -10,6 +10,7 @@ from shearloop.drivers.robotiq import messages
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.emulators.gripper import GripperRegisters
+from shearloop.errors import NotBegunError
 from tests.drivers.robotiq.gripper_rig import CALIBRATION, STEP_S, WAYS, Rig, a_rig
 
 
@@ -134,30 +135,32 @@ async def test_a_move_of_a_gripper_that_has_restarted_activates_nothing(way, tmp
 
 @pytest.mark.parametrize("active", [True, False])
 @WAYS
-async def test_a_request_that_is_not_wanted_any_more_as_it_is_sent_moves_nothing(way, active, tmp_path):
+async def test_a_request_that_is_not_permitted_any_more_as_it_is_sent_changes_nothing(way, active, tmp_path):
     """A daemon may stand still at any moment between a command and its last byte."""
     async with a_rig(way, tmp_path, active=active, connected=True) as rig:
-        before_mm, read = rig.model.width_mm, rig.driver.client.read
-        stood: list[str] = []
+        if active:
+            await rig.driver.finish(await rig.driver.move(messages.GripperCommand(0.0)))
+            await rig.driver.finish(await rig.driver.move(messages.GripperCommand(60.0)))
+        before, command, read = await rig.driver.read(), rig.model.command, rig.driver.client.read
+        stood: list[bool] = []
 
         async def read_at_length(*, whole: bool = False) -> messages.Readout:
-            stood.append("the daemon stood still")
+            stood.append(True)
             return await read(whole=whole)
 
+        def permit() -> None:
+            if stood:
+                raise NotBegunError("the daemon stood still")
+
         rig.driver.client.read = read_at_length
-
-        def refusal() -> str | None:
-            return stood[-1] if stood else None
-
-        closing = messages.GripperCommand(0.0)
-        with pytest.raises(messages.GripperRefusedError, match="the daemon stood still"):
-            await (rig.driver.move(closing, refusal) if active else rig.driver.activate(may_drop=True, refusal=refusal))
+        closing = messages.GripperCommand(20.0)
+        with pytest.raises(NotBegunError, match="the daemon stood still"):
+            await (rig.driver.move(closing, permit) if active else rig.driver.activate(may_drop=True, permit=permit))
         for _ in range(10):
             state = await rig.driver.read()
             rig.monotonic_ns()
-        assert (state.moves, state.others_requests, rig.model.width_mm) == (False, 0, before_mm)
-        # A halt is always wanted.
-        await rig.driver.halt()
+        assert rig.model.command == command
+        assert replace(state, t_ns=0) == replace(before, t_ns=0)
         assert rig.driver.connected
         await rig.driver.activate(may_drop=True)
         await rig.driver.finish(await rig.driver.move(messages.GripperCommand(30.0)))

@@ -237,7 +237,7 @@ def _plan_recordings(args: argparse.Namespace, paths: "Sequence[Path]") -> "tupl
     recipe = Recipe(args.estimator, bank, mesh, read.timing.uncertainty_s, nested=args.nested)
     names, twists = [path.name for path in read.paths], args.adapt_twists or 0
     plan = plan_left_out(args.leave_out, recipe, read.parts, names, adapt_twists=twists)
-    return plan, read.doubts, read.left_out
+    return plan, read.doubts, [*read.left_out, *read.of_other_tools]
 
 
 def _plan_slices(args: argparse.Namespace, paths: "Sequence[Path]") -> "tuple[Plan, Sequence[str], Sequence[str]]":

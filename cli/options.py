@@ -50,7 +50,7 @@ def path_of(text: str) -> Path:
     """Return the path of an option: shells leave `~` in `--out=~/a` as it is, and service files `$HOME`."""
     path: Path = expanded(expanded_path, text)
     if not is_possible(path):
-        raise argparse.ArgumentTypeError(f"{shown(text)} is the name of no file: it is too long, or has a zero byte")
+        raise argparse.ArgumentTypeError(f"{shown(text)} is the name of no file: too long, or with a wrong character")
     return path
 
 

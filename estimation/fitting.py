@@ -154,19 +154,29 @@ def _material(recordings: Sequence[FrameSeries], physics: Physics) -> Material:
 
 
 def _check_one_fingertip(side: str, parts: Sequence[tuple[int, GripParts]]) -> None:
-    """Raise CalibrationError where idle frames deviate from the first ones' as another fingertip's do.
+    """Raise CalibrationError where idle frames of a side deviate from the others as another fingertip's do.
 
-    `parts` are of a side, each with the number of its recording.
+    `parts` have the numbers of their recordings. All are compared with the one that is nearest to the others.
     """
-    first, *_ = idle_frames = [np.median(part.idle, axis=0) for _, part in parts]
-    for (number, _), idle in zip(parts, idle_frames, strict=True):
-        deviation = float(compare_frames(idle, first[None])[2][0])
-        if deviation > LARGEST_DEVIATION:
-            raise CalibrationError(
-                f"recording {number} is of another {side} fingertip or gel than recording {parts[0][0]}: its idle "
-                f"voltages deviate by {100 * deviation:.0f} %, more than {100 * LARGEST_DEVIATION:.0f} %. Leave it "
-                "out, or import it again if its sides are exchanged"
-            )
+    numbers = [number for number, _ in parts]
+    idle = np.array([np.median(part.idle, axis=0) for _, part in parts])
+    # By the frame that is compared, and the one that it is compared with.
+    deviations = np.array([compare_frames(frame, idle)[2] for frame in idle])
+    usual = int(np.median(deviations, axis=0).argmin())
+    odd = int(deviations[:, usual].argmax())
+    deviation = float(deviations[odd, usual])
+    # Frames without channels to compare are refused for that.
+    if not LARGEST_DEVIATION < deviation < np.inf:
+        return
+    differ = f"its idle voltages deviate by {100 * deviation:.0f} %, more than {100 * LARGEST_DEVIATION:.0f} %"
+    if numbers[odd] == numbers[usual]:
+        raise CalibrationError(
+            f"recording {numbers[odd]} is not of one {side} fingertip: between its grips {differ}. Use a part of it"
+        )
+    raise CalibrationError(
+        f"recording {numbers[odd]} is of another {side} fingertip or gel than recording {numbers[usual]}: {differ}. "
+        "Leave one of them out, or import one again if its sides are exchanged"
+    )
 
 
 def _clear_grips(recording: FrameSeries, number: int, of: int) -> list[Grip]:

@@ -18,8 +18,8 @@ LARGEST_TORQUE_NM = 20.0
 # A measured tool is another one if its diameter differs by a larger fraction of the known diameter.
 _LARGEST_TOOL_FRACTION = 0.15
 # Recorded loads change by up to 0.76 N·m/s, so that nothing is known between readings further apart. One reading of a
-# loop of two a second may be missing.
-LONGEST_LOAD_GAP_S = 1.2
+# loop of two a second may be missing, and one of a slower one.
+_LONGEST_LOAD_GAP_S, _LONGEST_LOAD_STEPS = 1.2, 2.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,13 +172,19 @@ class Estimate:
     lag_s: float = 0.0
 
 
+def longest_load_gap_s(torque_t_s: FloatArray) -> float:
+    """Return the longest time between readings (p,) in time order within which the torque is known."""
+    usual_s = float(np.median(np.diff(torque_t_s))) if len(torque_t_s) > 1 else 0.0
+    return max(_LONGEST_LOAD_GAP_S, _LONGEST_LOAD_STEPS * usual_s)
+
+
 def torque_at(t_s: FloatArray, torque_t_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
     """Return the (n,) torque at t_s (n,) from readings (p,) in time order, NaN in a gap between them."""
     if len(torque_t_s) == 0:
         return np.full(len(t_s), np.nan)
     after = np.searchsorted(torque_t_s, t_s).clip(0, len(torque_t_s) - 1)
     before_s, after_s = torque_t_s[np.maximum(after - 1, 0)], torque_t_s[after]
-    known = (after_s - before_s <= LONGEST_LOAD_GAP_S) | (t_s == after_s)
+    known = (after_s - before_s <= longest_load_gap_s(torque_t_s)) | (t_s == after_s)
     torque = np.interp(t_s, torque_t_s, torque_nm, left=np.nan, right=np.nan)
     return np.where(known, torque, np.nan)
 

@@ -43,8 +43,9 @@ class CalibrationResult:
     # The parts of recordings that it was fitted to, and the time in s that the fit took.
     parts: Sequence[FrameSeries] = ()
     fit_s: float = 0.0
-    # What of the recordings was not used, by their names.
+    # What of the recordings was not used, and where the stated tool does not count, by their names.
     left_out: Sequence[str] = ()
+    of_other_tools: Sequence[str] = ()
 
     @property
     def regressor(self) -> IntervalRegressor | None:
@@ -81,6 +82,8 @@ class CalibrationResult:
             found["timing_uncertainty_s"] = round(timing.uncertainty_s, 3)
         if self.left_out:
             found["readings_left_out"] = list(self.left_out)
+        if self.of_other_tools:
+            found["tool_mm_left_out"] = list(self.of_other_tools)
         if self.widening is not None:
             found["widening"] = self.widening
         return found | {"tool_mm": self.tool_mm}
@@ -109,7 +112,9 @@ def calibrate(
     known = [np.isfinite(part.torque_at_frames()) | np.isfinite(part.diameter_mm) for part in read.parts]
     frames = sum(int(part.sum()) for part in known)
     tools = distinct([part.tool_mm for part in read.parts if part.tool_mm is not None])
-    return CalibrationResult(calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out)
+    return CalibrationResult(
+        calibration, frames, read.timing, read.doubts, tools, read.parts, fit_s, read.left_out, read.of_other_tools
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +159,9 @@ class ReadParts:
     paths: Sequence[Path]
     timing: LoadTiming
     doubts: Sequence[str]
+    # What of the recordings was not used, and where the stated tool does not count, by their names.
     left_out: Sequence[str] = ()
+    of_other_tools: Sequence[str] = ()
 
 
 def read_parts(
@@ -194,8 +201,8 @@ def read_parts(
     warned = [pair for pair in zip(timing.references, timing.warnings, strict=True) if pair[1]]
     doubts = [f"{name}: {why}" for name, part in named for reference, why in warned if part is reference]
     left_out = [f"{path.name}: {'; '.join(part.left_out)}" for path, part in chosen if part.left_out]
-    left_out += not_of_tool([(path.name, part) for path, part in chosen], tool_mm)
-    return ReadParts(parts, [path for path, _ in chosen], timing, doubts, left_out)
+    of_other_tools = not_of_tool([(path.name, part) for path, part in chosen], tool_mm)
+    return ReadParts(parts, [path for path, _ in chosen], timing, doubts, left_out, of_other_tools)
 
 
 def adapt_to_recordings(
@@ -216,6 +223,7 @@ def adapt_to_recordings(
     start, stop = time_range
     named = [(str(path), recording) for path in paths for recording in read_series(path, calibration.sides, tool_mm)]
     check_no_copies(named)
+    # Where it counts for some alone, the recordings are of several tools, which `adapt` refuses.
     not_of_tool(named, tool_mm)
     series = [recording for _, recording in named]
     # Earlier frames show the session the idle fingertip.

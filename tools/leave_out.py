@@ -246,7 +246,8 @@ def without_estimate(tracks: Sequence[EstimateTrack]) -> str:
     if not against.total:
         return "No left-out frame with an estimate is under load: record twists of a tool."
     (count, why), *_ = against.most_frequent_first
-    return f"The rest gives too few estimates of the left-out frames: {why} ({count} of {against.total} loaded frames)."
+    of_those = f"({count} of the {against.total} loaded frames without one)"
+    return f"The rest gives too few estimates of the left-out frames: {why} {of_those}."
 
 
 def advice_of_coverage(tracks: Sequence[EstimateTrack], kind: str) -> str:

@@ -228,7 +228,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
         probably = "probably " if timing.uncertainty_s else ""
         sentences.append(f"The load is {probably}stamped {', '.join(known)} the frames move.")
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
-    sentences += [f"Left out: {omission}." for omission in result.left_out]
+    sentences += [f"Left out: {omission}." for omission in (*result.left_out, *result.of_other_tools)]
     if result.widening is not None:
         effect = "and the intervals of loaded frames do not allow for it"
         if result.widening > 1.0:

@@ -75,8 +75,9 @@ class MessageStore:
         self.instance: str | None = None
         self.refused: Counter[str] = Counter()
         self._log = EventLog()
-        # The times of the stop that waits for its acknowledgement, with the number of its run.
-        self._stop_times: tuple[int | None, str] = (None, "")
+        # The number of the stop that waits for its acknowledgement; the latest stop's number, run and times.
+        self._stop = 0
+        self._stop_times: tuple[int, int | None, str] = (0, None, "")
 
     def add(self, topic: str, content: Mapping[str, Any], now_s: float) -> None:
         """Store one decoded message that arrived at `now_s`; count invalid ones by kind."""
@@ -140,13 +141,13 @@ class MessageStore:
             known = MODELS.get(self._models[source])
             return {"peaks": _peaks(content.get("scores")), "k_unit": known.k_unit if known is not None else ""}
         if topic == LoopStop.topic:
-            self._stop_times = content.get("run"), stop_times(content)
+            self._stop_times = self._stop, content.get("run"), stop_times(content)
         if topic == LoopState.topic:
-            run, times = self._stop_times
-            if content.get("stop") == 0 or content.get("run") != run:
-                # An acknowledged stop's times are not the next one's.
-                self._stop_times, times = (None, ""), ""
-            return {"stop_times": times}
+            self._stop = int(content.get("stop") or 0)
+            number, run, times = self._stop_times
+            # The times of an earlier stop are not those of this one.
+            is_this_one = number == self._stop != 0 and run == content.get("run")
+            return {"stop_times": times if is_this_one else ""}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")

@@ -113,10 +113,13 @@ def lock(handle: int, path: Path) -> None:
 
 def is_possible(path: Path) -> bool:
     """Return whether a file of Linux can have a path."""
-    names = [os.fsencode(part) for part in path.parts]
-    return (
-        not any(b"\0" in name or len(name) > _LONGEST_NAME for name in names) and sum(map(len, names)) < _LONGEST_PATH
-    )
+    try:
+        written, names = os.fsencode(path), [os.fsencode(part) for part in path.parts]
+    except UnicodeEncodeError:
+        return False
+    if b"\0" in written or len(written) >= _LONGEST_PATH:
+        return False
+    return all(len(name) <= _LONGEST_NAME for name in names)
 
 
 def near_name(path: Path) -> str:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import FrameSeries, HeldTool, Measured, TactileFrame, combine
 from shearloop.estimation.series import distinct
+from shearloop.estimation.values import torque_at
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
 
@@ -79,6 +80,13 @@ def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
     known = (t_s < 3.0) | (t_s >= 9.0)
     np.testing.assert_array_equal(np.isfinite(torque), known)
     np.testing.assert_allclose(torque[known], np.sin(t_s[known]), atol=2e-3)
+
+
+def test_a_slow_load_cell_is_known_between_its_readings():
+    t_s, readings_s = np.arange(0.0, 30.0, 0.5), np.delete(np.arange(0.0, 30.0, 1.5), [10, 11])
+    torque = torque_at(t_s, readings_s, np.ones(len(readings_s)))
+    gap = (t_s > 13.5) & (t_s < 18.0)
+    np.testing.assert_array_equal(np.isfinite(torque), ~gap & (t_s <= readings_s[-1]))
 
 
 def test_torque_at_frames_is_interpolated_and_never_extrapolated():

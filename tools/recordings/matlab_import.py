@@ -29,7 +29,7 @@ from shearloop.drivers.serial_sensor import StepFilter
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
-from shearloop.estimation.values import LARGEST_TORQUE_NM, LONGEST_LOAD_GAP_S
+from shearloop.estimation.values import LARGEST_TORQUE_NM, longest_load_gap_s
 from shearloop.files import open_file
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
@@ -486,7 +486,7 @@ def _missing(side: str, arrivals_ns: Sequence[int]) -> str:
 def _missing_load(stamps_s: FloatArray) -> Iterator[str]:
     """Yield the remark on load values that are missing, where there is one."""
     pauses_s = np.diff(stamps_s)
-    pauses_s = pauses_s[pauses_s > LONGEST_LOAD_GAP_S]
+    pauses_s = pauses_s[pauses_s > longest_load_gap_s(stamps_s)]
     if len(pauses_s):
         yield (
             f"Load values are missing in {counted(len(pauses_s), 'place')}, for up to {pauses_s.max():.1f} s: frames "

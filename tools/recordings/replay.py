@@ -416,8 +416,9 @@ class Replay:
         }
         if config.combined is not None:
             self._sessions[COMBINED] = open_combined(config.combined, config.fingertips)
-        for session in self._sessions.values() if run.tool is not None else ():
-            session.set_tool(run.tool)
+        if (tool := run.tool) is not None:
+            for session in self._sessions.values():
+                session.set_tool(tool)
         self._frame_parsers = {
             name: FrameParser(
                 self._sessions[name].calibration.table.zero_slots,

@@ -161,3 +161,20 @@ def test_a_heatmap_has_the_unit_of_k_of_its_model(model, unit):
     latest = MessageStore(3.6)
     latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model=model), 1.0)
     assert batch(latest)["messages"][0]["k_unit"] == unit
+
+
+def test_a_stop_has_its_own_times_and_no_others():
+    """The times come some moments after the stop; a further cause, and a stop while nothing moves, have none."""
+    latest = MessageStore(3.6)
+
+    def shown(stop: int, run: int = 1) -> str:
+        latest.add("loop.state", message("loop", stop=stop, run=run, phase="stopped"), 1.0)
+        (state,) = (each for each in batch(latest)["messages"] if each["topic"] == "loop.state")
+        return str(state["stop_times"])
+
+    assert shown(1) == ""
+    latest.add("loop.stop", message("loop", run=1, decided_after_s=0.01, sent_after_s=0.02, stands_after_s=0.1), 1.0)
+    assert "standstill after 0.100 s" in shown(1)
+    assert shown(2) == "", "a further cause without an acknowledgement"
+    assert shown(0) == shown(3) == ""
+    assert shown(1, run=2) == ""

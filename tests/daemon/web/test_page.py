@@ -267,6 +267,7 @@ def test_a_hold_shows_its_cause_then_the_codes_of_others_and_their_sentences_on_
                     "cause": CAUSE,
                     "reasons": REASONS,
                     "activity": "a",
+                    "stop": 1,
                 },
             },
             {
@@ -293,12 +294,12 @@ def test_a_stop_has_the_times_of_its_own_run(browsed):
     """The experiment of the same name is stopped again, and the times of its stop come later."""
     stopped = {"phase": "stopped", "response": "stop and keep grip", "cause": CAUSE, "reasons": CAUSE}
     browsed.open()
-    browsed.daemon.say(loop={**stopped, "run": 1, "step": 1})
+    browsed.daemon.say(loop={**stopped, "run": 1, "step": 1, "stop": 1})
     browsed.until("#stop-times", "standstill after 0.123 s")
-    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2})
+    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2, "stop": 2})
     browsed.until("#phase-name", "step 2 of")
     assert browsed.text("#stop-times") == ""
-    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2}, stop={"run": 2, "stands_after_s": 0.2})
+    browsed.daemon.say(loop={**stopped, "run": 2, "step": 2, "stop": 2}, stop={"run": 2, "stands_after_s": 0.2})
     browsed.until("#stop-times", "standstill after 0.200 s")
 
 

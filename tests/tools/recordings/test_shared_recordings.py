@@ -176,8 +176,11 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 
 def test_recordings_of_different_fingertips_make_no_calibration(twists, shared, tmp_path):
     other = imported(tmp_path / "exchanged.mcap", shared / "recordings/streams/20241202_153632")
-    with pytest.raises(CalibrationError, match="recording 2 is of another right fingertip or gel than recording 1"):
-        fit("motion_regression", [twists, other], "two fingertips")
+    again = replace(twists, channels=1.02 * twists.channels)
+    for recordings, odd in (((twists, other), "[12]"), ((other, twists, again), "1"), ((twists, again, other), "3")):
+        named = rf"^recording {odd} is of another right fingertip or gel than recording [12]: its idle voltages deviate by 1"
+        with pytest.raises(CalibrationError, match=named):
+            fit("motion_regression", recordings, "two fingertips")
 
 
 def test_a_grip_much_stronger_than_the_calibrated_one_is_refused_and_evaluate_says_so(twists, shared, tmp_path, ran):

@@ -26,7 +26,7 @@ from shearloop.daemon.control.experiment_schema import (
     is_whole,
     outline,
 )
-from shearloop.daemon.control.known_tool import NOTHING_KNOWN
+from shearloop.daemon.control.known_tool import NOTHING_KNOWN, known_after
 from shearloop.daemon.control.step_demands import demand
 from shearloop.daemon.control.turns import Turn, turns
 from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
@@ -80,9 +80,10 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
     These are the first `hold_torque` on an unidentified tool, a `tare` of a gripped one, a torque that undoes a
-    `tighten`, and a `grip` wider than the one before it. No limit above the `cap` is of use.
+    `tighten`, a `grip` wider than the one before it, and a limit below the torque that is held at the step's begin. No
+    limit above the `cap` is of use.
     """
-    found: list[Mistake] = [*_undoing(file), *_opening(file)]
+    found: list[Mistake] = [*_undoing(file), *_opening(file), *_begun_beyond_limits(file)]
     identified = gripped = False
     for number, (step, turn) in enumerate(_with_turns(file)):
         found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, turn, cap)]
@@ -119,6 +120,20 @@ def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap:
     if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
         asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
         yield f"{asks}; raise timeout_s"
+
+
+def _begun_beyond_limits(file: ExperimentFile) -> Iterator[Mistake]:
+    """Yield each step whose torque limit would stop it as it begins, and drop the tool."""
+    known = NOTHING_KNOWN
+    for number, step in enumerate(file.steps) if is_whole(file) else ():
+        held_nm, limit_nm = known.torque_nm.exact, file.limits_of(step).torque_nm
+        if held_nm is not None and abs(held_nm) >= limit_nm and not isinstance(step, ReleaseStep):
+            yield (
+                ("steps", number),
+                f"the steps before it leave {abs(held_nm):g} N·m on the tool, and its limit is {limit_nm:g} N·m: it "
+                "would be stopped as it begins, and the gripper opened; raise limits.torque_nm, or hold less before it",
+            )
+        known = known_after(step, known)
 
 
 def _forgets_tool(step: Step, torque_source: str) -> bool:

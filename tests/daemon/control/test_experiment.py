@@ -363,3 +363,23 @@ def test_only_a_release_between_a_tightening_and_its_undoing_prevents_the_refusa
     file = ExperimentFile.model_validate({"name": "one", "steps": steps})
     undoing = [text for _, text in check_steps(file) if "undoes step 2, tighten clockwise" in text]
     assert len(undoing) == refused
+
+
+@pytest.mark.parametrize(
+    ("first", "later", "refused"),
+    [
+        ({**HOLD, "torque_nm": 0.12}, {**HOLD, "torque_nm": 0.05, "limits": {"torque_nm": 0.08}}, True),
+        ({**HOLD, "torque_nm": 0.12}, {"do": "wait", "wait_s": 1, "limits": {"torque_nm": 0.08}}, True),
+        ({**HOLD, "torque_nm": -0.12}, {"do": "turn_to", "angle_rad": 1.0, "limits": {"torque_nm": 0.1}}, True),
+        ({**HOLD, "torque_nm": 0.12}, {"do": "wait", "wait_s": 1, "limits": {"torque_nm": 0.13}}, False),
+        ({**HOLD, "torque_nm": 0.12}, {**RELEASE, "limits": {"torque_nm": 0.08}}, False),
+        ({"do": "twist", "angles_rad": [0.1]}, {"do": "wait", "wait_s": 1, "limits": {"torque_nm": 0.08}}, False),
+    ],
+)
+def test_a_limit_below_the_torque_that_is_held_at_a_steps_begin_is_refused(first, later, refused):
+    """The step would be stopped as it begins, and the tool dropped."""
+    file = ExperimentFile.model_validate({"name": "one", "steps": [GRIP, {"do": "identify"}, first, later]})
+    found = [text for place, text in check_steps(file) if place == ("steps", 3)]
+    assert [text.startswith("the steps before it leave 0.12 N·m on the tool, and its limit is") for text in found] == [
+        True
+    ] * refused

@@ -178,7 +178,7 @@ def test_recordings_of_different_fingertips_make_no_calibration(twists, shared, 
     other = imported(tmp_path / "exchanged.mcap", shared / "recordings/streams/20241202_153632")
     again = replace(twists, channels=1.02 * twists.channels)
     for recordings, odd in (((twists, other), "[12]"), ((other, twists, again), "1"), ((twists, again, other), "3")):
-        named = rf"^recording {odd} is of another right fingertip or gel than recording [12]: its idle voltages deviate by 1"
+        named = rf"^recording {odd} is of another right fingertip or gel than recording [12]: its"
         with pytest.raises(CalibrationError, match=named):
             fit("motion_regression", recordings, "two fingertips")
 

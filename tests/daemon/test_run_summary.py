@@ -288,7 +288,7 @@ def test_a_late_stop_of_an_emulated_rig_names_the_busy_computer(code, detail, sh
     sentence = Fault(code, detail).sentence
     stopped = loop_state(5, phase="stopped", activity=f"{sentence} And more.", cause=sentence, faults=code.text)
     text = summary_of(loop_state(0), stopped)
-    assert text.lstrip().startswith("This computer was too busy for the emulated rig") == shown
+    assert text.lstrip().startswith("If no device was unplugged, this computer was too busy") == shown
     assert text.count(sentence) == 1
     assert "And more" not in text
     on_a_rig = RunSummary(out := StringIO())

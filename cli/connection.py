@@ -54,7 +54,7 @@ def client_keys(args: argparse.Namespace, address: str | None = None) -> "Client
     address = address or args.connect
     why = ""
     if addresses.needs_keys(address):
-        why = f"{address} is not on this machine"
+        why = f"{address} is an address of the network"
     elif stop_client.is_open_to_network(address):
         why = f"the daemon at {address} is open to the network and answers only with keys"
     if not why and args.key is None and args.server_key is None:

@@ -321,7 +321,7 @@ class DaemonConfig(ConfigModel):
     experiment: Path | None = Field(
         None, description="the experiment that `shearloop command start` runs if it names no other one"
     )
-    autostart: bool = Field(False, description="start `experiment` when all devices are connected; needs `emulated`")
+    autostart: bool = Field(False, description="start `experiment` as soon as nothing refuses it; needs `emulated`")
     experiments: tuple[Path, ...] = Field(
         (),
         validate_default=True,

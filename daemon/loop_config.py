@@ -20,7 +20,9 @@ class LoopConfig(ConfigModel):
         default=None, gt=0, le=1, description="fixed gain; without it the gain follows from the noise"
     )
     deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
-    disagreement_nm: float = Field(default=0.05, gt=0, le=5, description="largest difference of two torque sources")
+    disagreement_nm: float = Field(
+        default=0.05, gt=0, le=5, description="largest difference of two torques, plus the wrench's noise"
+    )
     max_innovation_nm: float = Field(default=0.08, gt=0, le=5, description="largest error of the expected torque")
     max_offset_drift_nm: float = Field(
         default=0.06,

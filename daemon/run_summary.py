@@ -21,7 +21,10 @@ TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 _ENDS = ("done", "stopped")
 # Of a hold for too long, from this fraction of the time with a fault of a busy computer on.
 _LATE_FRACTION = 0.1
-_TOO_BUSY = "If no device was unplugged, this computer was too busy for the emulated rig: close other programs and run it again."
+_TOO_BUSY = (
+    "Unless a device was unplugged, this computer was too busy for the emulated rig: close other programs and run it "
+    "again."
+)
 _ASKED_FOR = frozenset(code.text for code in FaultCode if code.value.asked_for)
 _BY_BUSY_COMPUTER = frozenset(code.text for code in FaultCode if code.value.by_busy_computer)
 

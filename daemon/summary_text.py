@@ -15,6 +15,8 @@ from shearloop.words import counted, times
 BAND = 0.10
 # A smaller band is within the noise of every torque.
 SMALLEST_BAND_NM = 0.001
+# A torque that was measured within this time of a step's end is that of its end.
+_AT_THE_END_S = 1.5
 # A spread below this fraction of the half interval is none: friction hides how the torque moved.
 MIN_SPREAD = 0.2
 # A torque has recovered from a disturbance when it stays in the band for this time.
@@ -66,10 +68,19 @@ def _turned(step: StepSummary, run: Run, truth: TorqueSeries | None) -> Iterator
         turned = with_unit("robot.state", "wrist_rad", step.wrist_to_rad - step.wrist_from_rad, "+.3f")
         yield f"    turned by {turned}; {_named(driving, truth)}"
     for name, series in _all_torques(run, truth).items():
-        turning = series.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in (TRUE, driving):
-            largest_nm = turning[np.abs(turning).argmax()]
-            yield f"    {name:<11} {_torque(turning[-1], '+.4f')} at the end, {largest_nm:+.4f} at most"
+        turning = series.between(step.from_ns, step.to_ns)
+        if turning.torque_nm.size and name in (TRUE, driving):
+            largest_nm = turning.torque_nm[np.abs(turning.torque_nm).argmax()]
+            when = _before_the_end(turning, step.to_ns)
+            yield f"    {name:<11} {_torque(turning.torque_nm[-1], '+.4f')} {when}, {largest_nm:+.4f} at most"
+
+
+def _before_the_end(series: TorqueSeries, end_ns: float) -> str:
+    """Return when the last torque was measured, before the end or at it."""
+    before_s = (end_ns - series.t_ns[-1]) / 1e9
+    # The next one is under way, and one may be missing.
+    is_last = before_s <= max(_AT_THE_END_S, 4 * series.half_ns / 1e9)
+    return "at the end" if is_last else f"{before_s:.1f} s before the end, and none since"
 
 
 def _torque(torque_nm: float, form: str) -> str:

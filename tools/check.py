@@ -74,7 +74,7 @@ def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulat
         check_emulators(config.emulators, path)
     if config.curve is not None:
         with parts.of("keys"):
-            parts.texts["keys"] = f"{_clients(config.curve)} may connect"
+            parts.texts["keys"] = _clients(config.curve)
     with parts.of(EMULATED_CALIBRATIONS):
         refuse_emulated_calibrations(config)
     for name, fingertip in config.fingertips.items():
@@ -270,7 +270,8 @@ def _clients(curve: "CurveConfig") -> str:
     from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
 
     load_server_keys(curve.server_key)
-    return ", ".join(sorted(check_allowed_clients(curve.clients).names.values()))
+    clients = check_allowed_clients(curve.clients)
+    return "; ".join([f"{', '.join(sorted(clients.names.values()))} may connect", *clients.unusable])
 
 
 def _skin(config: "SkinConfig") -> str:

@@ -333,7 +333,7 @@ def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = N
         keys.apply(socket)
     elif needs_keys(address):
         raise UserError(
-            f"{address} is not on this machine: give your key and the daemon's, as `ClientKeys`; "
+            f"{address} is an address of the network: give your key and the daemon's, as `ClientKeys`; "
             "`shearloop keys client` makes yours, docs/service.md shows the rest"
         )
     try:

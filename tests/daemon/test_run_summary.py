@@ -273,6 +273,16 @@ def test_the_summary_of_a_tightening_has_the_angle_and_the_final_and_largest_tor
     assert "    load_cell   -0.1210 N·m at the end, -0.1760 at most" in text
 
 
+def test_a_torque_that_was_measured_long_before_the_end_of_a_tightening_says_so():
+    turning = {"step_name": "tighten", "torque_source": "right", "set_point_nm": None}
+    measured = [
+        {"source": "right", "t_mono_ns": round(t_s * S), "torque_nm": -0.01 * t_s} for t_s in (10.2, 10.7, 11.2)
+    ]
+    for end_s, when in ((11.9, "at the end"), (17.0, "5.8 s before the end, and none since")):
+        text = summary_of(loop_state(10, **turning), *measured, loop_state(end_s, phase="stopped", **turning))
+        assert f"    right       -0.1120 N·m {when}, -0.1120 at most" in text
+
+
 @pytest.mark.parametrize(
     ("code", "detail", "shown"),
     [
@@ -288,7 +298,7 @@ def test_a_late_stop_of_an_emulated_rig_names_the_busy_computer(code, detail, sh
     sentence = Fault(code, detail).sentence
     stopped = loop_state(5, phase="stopped", activity=f"{sentence} And more.", cause=sentence, faults=code.text)
     text = summary_of(loop_state(0), stopped)
-    assert text.lstrip().startswith("If no device was unplugged, this computer was too busy") == shown
+    assert text.lstrip().startswith("Unless a device was unplugged, this computer was too busy") == shown
     assert text.count(sentence) == 1
     assert "And more" not in text
     on_a_rig = RunSummary(out := StringIO())

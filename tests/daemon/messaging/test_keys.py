@@ -80,6 +80,13 @@ def test_a_network_address_needs_existing_keys(config, keys, ran, mistake):
     assert "holds no key, so no client could connect" in mistake("run", config(commands=NETWORK, curve=curve(keys)))
 
 
+def test_check_names_the_allowed_clients_and_files_that_are_no_keys(config, keys, ran):
+    junk = keys / "keys/clients/junk.key"
+    junk.write_text("no key\n")
+    said = ran("check", config(commands=NETWORK, curve=curve(keys))).out
+    assert f"ada may connect; {junk} is no key file; " in said
+
+
 @pytest.fixture
 def connect() -> Iterator[Callable[..., "zmq.asyncio.Socket"]]:
     with zmq.asyncio.Context() as context:

@@ -87,7 +87,9 @@ def _allow(args: argparse.Namespace) -> int:
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
     _check_name(name)
-    allowed = allowed_clients(clients).names
+    allowed, server = allowed_clients(clients).names, args.dir / "server.key"
+    if server.exists() and load_public_key(server) == public:
+        raise UserError(f"{args.key} is the daemon's own key: allow the client.key that `shearloop keys client` makes")
     if public in allowed:
         raise UserError(f"{args.key} is allowed already, as {allowed[public]}")
     if name in allowed.values():

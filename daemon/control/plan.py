@@ -223,7 +223,9 @@ def plan_of(
                 refused=(refused or {}).get(number - 1, ()),
             )
         )
-    unknown = "" if robot is not None else "the robot's limits are not known: give `--config RIG` to check against them"
+    unknown = ""
+    if robot is None:
+        unknown = "the robot's limits are not known: they come from the robot's settings of `--config RIG`, if in order"
     assumed = _assumed(file) if start is None else ""
     limits = file.limits
     return Plan(file.name, file.torque_source, limits.torque_nm, limits.angle_rad, tuple(planned), unknown, assumed)

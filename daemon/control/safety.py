@@ -188,7 +188,7 @@ class SafetyMonitor:
             # It may hide the robot's other faults, and makes the robot refuse commands. Both are reported after it.
             later_codes = (_SHOWN_AT_REST - active_codes) | {FaultCode.COMMAND_REFUSED}
         else:
-            over_codes = _SHOWN_AT_REST
+            over_codes = _SHOWN_AT_REST | _LOSSES
         kept = [replace(one, is_over=one.code in over_codes) for one in stop.faults if one.code not in active_codes]
         kept += [fault for fault in active if fault.code in stop_codes]
         kept.sort(key=lambda fault: stop_codes.index(fault.code))

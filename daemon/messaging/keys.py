@@ -149,7 +149,7 @@ def allowed_clients(folder: Path) -> AllowedClients:
     except OSError as error:
         raise UserError(
             f"{folder}: the allowed clients' keys cannot be read: {error.strerror}; "
-            "`sudo shearloop keys server` makes the folder"
+            f"`sudo shearloop keys server --dir {shlex.quote(str(folder.parent))}` makes the folder"
         ) from error
     names: dict[bytes, str] = {}
     unusable: list[str] = []

@@ -1,6 +1,7 @@
 """The gripper over its USB adapter: Modbus RTU with pymodbus (manual, "Gripper register mapping")."""
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 
 from pymodbus.client import AsyncModbusSerialClient
@@ -132,6 +133,7 @@ class ModbusClient:
         client = self._client
         if client is None:
             raise DeviceLostError(f"There is no connection to the gripper at {self.name} at present.")
+        began_s = time.monotonic()
         try:
             if command is None:
                 request = client.read_holding_registers(
@@ -146,8 +148,10 @@ class ModbusClient:
             await self.close()
             if not isinstance(error, ModbusException | OSError):
                 raise
+            # A port that has gone fails at once.
+            waited = time.monotonic() - began_s >= self._deadline_s
+            why = f"did not answer within {self._deadline_s:g} s" if waited else "gives no answer"
             raise DeviceLostError(
-                f"The gripper at {self.name} did not answer within {self._deadline_s:g} s: "
-                "unplugged, without power, or another program uses the port."
+                f"The gripper at {self.name} {why}: unplugged, without power, or another program uses the port."
             ) from error
         return response

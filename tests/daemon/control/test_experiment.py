@@ -380,6 +380,16 @@ def test_a_limit_below_the_torque_that_is_held_at_a_steps_begin_is_refused(first
     """The step would be stopped as it begins, and the tool dropped."""
     file = ExperimentFile.model_validate({"name": "one", "steps": [GRIP, {"do": "identify"}, first, later]})
     found = [text for place, text in check_steps(file) if place == ("steps", 3)]
-    assert [text.startswith("the steps before it leave 0.12 N·m on the tool, and its limit is") for text in found] == [
-        True
-    ] * refused
+    assert len(found) == refused
+    assert all(text.startswith("the steps before it leave 0.12 N·m on the tool, and its limit is") for text in found)
+
+
+@pytest.mark.parametrize(("limit_rad", "refused"), [(0.2, True), (0.3, True), (0.31, False)])
+def test_a_limit_below_the_angle_at_which_a_step_begins_is_refused(limit_rad, refused):
+    twist = {"do": "twist", "angles_rad": [0.3], "return_to_start": False}
+    later = {"do": "wait", "wait_s": 1, "limits": {"angle_rad": limit_rad}}
+    file = ExperimentFile.model_validate({"name": "one", "limits": {"angle_rad": 1}, "steps": [GRIP, twist, later]})
+    found = [text for place, text in check_steps(file) if place == ("steps", 2)]
+    assert [
+        text.startswith("the steps before it leave the tool turned by 0.3 rad, and its limit") for text in found
+    ] == [True] * refused

@@ -54,6 +54,16 @@ def test_the_cause_of_a_stop_keeps_its_words_while_the_robot_is_made_ready():
     assert gate.acknowledged.causes == "the robot is in a protective stop: look for its cause"
 
 
+@pytest.mark.parametrize("code", [FaultCode.DEVICE_LOST, FaultCode.ROBOT_LOST, FaultCode.ROBOT_BLOCKED])
+def test_a_cause_that_is_no_longer_shown_is_over_and_asks_for_nothing_that_is_done(code):
+    gate = SafetyMonitor()
+    present = gate.judge([trouble(code)], 0).reported[0]
+    assert present.sentence.startswith(TABLE[code].kind)
+    over = gate.judge([], SECOND).reported[0]
+    assert over.sentence.startswith(f"over by now: {TABLE[code].kind}")
+    assert over.sentence.endswith("on the bench. Look at the rig, then send `shearloop command unlock`.")
+
+
 def test_a_stop_has_a_larger_number_after_each_further_cause_and_not_while_one_lasts():
     gate = SafetyMonitor()
     assert gate.stop_number == 0

@@ -215,6 +215,7 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
         (["server"], "exists already"),
         (["allow", str(keys / "ada/client.key"), "--name", "eve"], "is allowed already, as ada"),
         (["allow", str(folder / "server.key"), "--name", "../eve"], "is not a client's name"),
+        (["allow", str(folder / "server.key")], "server.key is the daemon's own key: allow the client.key"),
         (["revoke", "eve"], "there is no client 'eve'; the allowed clients are ada"),
     ):
         assert why in mistake("keys", *arguments, "--dir", folder)

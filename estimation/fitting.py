@@ -162,11 +162,12 @@ def _check_one_fingertip(side: str, parts: Sequence[tuple[int, GripParts]]) -> N
     idle = np.array([np.median(part.idle, axis=0) for _, part in parts])
     # By the frame that is compared, and the one that it is compared with.
     deviations = np.array([compare_frames(frame, idle)[2] for frame in idle])
+    # Frames without channels to compare are refused for that.
+    deviations[~np.isfinite(deviations)] = 0.0
     usual = int(np.median(deviations, axis=0).argmin())
     odd = int(deviations[:, usual].argmax())
     deviation = float(deviations[odd, usual])
-    # Frames without channels to compare are refused for that.
-    if not LARGEST_DEVIATION < deviation < np.inf:
+    if deviation <= LARGEST_DEVIATION:
         return
     differ = f"its idle voltages deviate by {100 * deviation:.0f} %, more than {100 * LARGEST_DEVIATION:.0f} %"
     if numbers[odd] == numbers[usual]:

@@ -18,8 +18,10 @@ LARGEST_TORQUE_NM = 20.0
 # A measured tool is another one if its diameter differs by a larger fraction of the known diameter.
 _LARGEST_TOOL_FRACTION = 0.15
 # Recorded loads change by up to 0.76 N·m/s, so that nothing is known between readings further apart. One reading of a
-# loop of two a second may be missing, and one of a slower one.
-_LONGEST_LOAD_GAP_S, _LONGEST_LOAD_STEPS = 1.2, 2.2
+# loop of two a second may be missing, and one of a slower one, up to a limit.
+_LOAD_GAP_S, _LOAD_GAP_STEPS, _LARGEST_LOAD_GAP_S = 1.2, 2.2, 3.5
+# Fewer readings do not show how slow a loop is.
+_LEAST_READINGS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +176,8 @@ class Estimate:
 
 def longest_load_gap_s(torque_t_s: FloatArray) -> float:
     """Return the longest time between readings (p,) in time order within which the torque is known."""
-    usual_s = float(np.median(np.diff(torque_t_s))) if len(torque_t_s) > 1 else 0.0
-    return max(_LONGEST_LOAD_GAP_S, _LONGEST_LOAD_STEPS * usual_s)
+    usual_s = float(np.median(np.diff(torque_t_s))) if len(torque_t_s) >= _LEAST_READINGS else 0.0
+    return min(max(_LOAD_GAP_S, _LOAD_GAP_STEPS * usual_s), _LARGEST_LOAD_GAP_S)
 
 
 def torque_at(t_s: FloatArray, torque_t_s: FloatArray, torque_nm: FloatArray) -> FloatArray:

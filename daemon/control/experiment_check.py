@@ -123,7 +123,7 @@ def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap:
 
 
 def _begun_beyond_limits(file: ExperimentFile) -> Iterator[Mistake]:
-    """Yield each step that would be stopped as it begins, because the tool is beyond its limits."""
+    """Yield each step that may be stopped as it begins, because the tool is beyond its limits."""
     known = NOTHING_KNOWN
     for number, step in enumerate(file.steps) if is_whole(file) else ():
         held_nm, limit_nm = known.torque_nm.exact, file.limits_of(step).torque_nm
@@ -131,14 +131,14 @@ def _begun_beyond_limits(file: ExperimentFile) -> Iterator[Mistake]:
             yield (
                 ("steps", number),
                 f"the steps before it leave {abs(held_nm):g} N·m on the tool, and its limit is {limit_nm:g} N·m: it "
-                "would be stopped as it begins, and the gripper opened; raise limits.torque_nm, or hold less before it",
+                "may be stopped as it begins, and the gripper opened; raise limits.torque_nm, or hold less before it",
             )
         turned_rad, limit_rad = known.angle_rad.exact, file.limits_of(step).angle_rad
         if turned_rad is not None and abs(turned_rad) >= limit_rad and not isinstance(step, GripperStep):
             yield (
                 ("steps", number),
                 f"the steps before it leave the tool turned by {abs(turned_rad):g} rad, and its limit is {limit_rad:g} "
-                "rad: it would be stopped as it begins; raise limits.angle_rad, or turn back before it",
+                "rad: it may be stopped as it begins; raise limits.angle_rad, or turn back before it",
             )
         known = known_after(step, known)
 

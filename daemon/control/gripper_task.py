@@ -27,7 +27,7 @@ from shearloop.drivers.robotiq.messages import (
     ObjectStatus,
 )
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
-from shearloop.errors import ActionError, NotBegunError
+from shearloop.errors import ActionError, NotBegunError, NotContinuedError
 from shearloop.estimation import Measured, combine
 from shearloop.estimation.values import TWO_SIDED_95
 
@@ -273,8 +273,8 @@ async def _tried(act: Callable[[], Awaitable[None]]) -> None:
     while True:
         try:
             return await act()
-        except NotBegunError:
-            # What was not begun for a reason is not begun later by itself.
+        except (NotBegunError, NotContinuedError):
+            # What is refused for a reason does not begin later by itself.
             raise
         except (ActionError, DriverError):
             if asyncio.get_running_loop().time() > tries_until_s:

@@ -93,7 +93,9 @@ class ControlLoopRunner:
 
         After an unexpected error the arm is stopped and the error is raised; the next run stops the experiment.
         """
-        self._decided_ns, self._running = self._clock.now_ns(), True
+        # After a crash the loop may have been away for long.
+        self._note_pause(self._clock.now_ns())
+        self._running = True
         try:
             while True:
                 # Without a state the loop decides all the same.
@@ -126,6 +128,9 @@ class ControlLoopRunner:
         experiment, stopped = self._control_loop.running_experiment, self._stop_operator_action()
         if experiment is not None:
             stopped = experiment.file.name
+        elif not self.actions.finishing:
+            # After a motion that failed they may still move.
+            self.actions.halt_fingers()
         if stopped is not None or also_idle:
             what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"
             self._request_stop(Fault(FaultCode.OPERATOR_STOP, what))
@@ -373,14 +378,18 @@ class ControlLoopRunner:
             torque = TorqueSample(WRENCH, -wrench.torque_nm, "", wrench.t_mid_ns, self._clock.now_ns())
             self._control_loop.on_torque(torque)
 
-    def _decide(self) -> None:
-        now_ns = self._clock.now_ns()
-        # From decision to decision, so that a slow decision is late as well.
+    def _note_pause(self, now_ns: int) -> float:
+        """Note a standstill since the latest decision; return the time since then in s."""
         pause_s = (now_ns - self._decided_ns) / 1e9
         if pause_s > self._longest_pause_s:
             self._stood_s, self._returned_ns = pause_s, now_ns
-        late_s = pause_s - (LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S)
         self._decided_ns = now_ns
+        return pause_s
+
+    def _decide(self) -> None:
+        now_ns = self._clock.now_ns()
+        # From decision to decision, so that a slow decision is late as well.
+        late_s = self._note_pause(now_ns) - (LONGEST_TICK_S if self._may_be_moving else LONGEST_REST_S)
         sent_rad_per_s = None if self._sender.unanswered else self._sender.sent_rad_per_s
         output = self._control_loop.tick(now_ns, max(0.0, late_s), sent_rad_per_s)
         match output:

@@ -12,7 +12,7 @@ from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
-from shearloop.errors import ActionError, NotBegunError
+from shearloop.errors import ActionError, NotBegunError, NotContinuedError
 
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 
@@ -21,21 +21,30 @@ UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait f
 class MotionPermit:
     """A person's permission of a motion: until it expires, and as long as the daemon does not stand still.
 
-    A motion that has begun does not expire. `given_ns` is CLOCK_MONOTONIC; `why_stood_still` says whether the daemon
+    What has begun in time does not expire. `given_ns` is CLOCK_MONOTONIC; `why_stood_still` says whether the daemon
     stood still since then.
     """
 
     deadline: Deadline
     given_ns: int
     why_stood_still: Callable[[int], str | None]
-    _taken: bool = False
+    _in_time: bool = False
+    _fingers_moved: bool = False
 
-    def take(self) -> None:
-        """Begin the motion, or go on with it; raises NotBegunError where it is no longer what the person wants."""
-        late = None if self._taken else self.deadline.why_passed("reaching the robot or the gripper")
+    def begin(self) -> None:
+        """Begin the action, or go on with it; raises where it is no longer what the person wants.
+
+        NotBegunError before the fingers have moved, NotContinuedError after that.
+        """
+        late = None if self._in_time else self.deadline.why_passed("reaching the robot or the gripper")
         if (reason := late or self.why_stood_still(self.given_ns)) is not None:
-            raise NotBegunError(reason)
-        self._taken = True
+            raise NotContinuedError(reason) if self._fingers_moved else NotBegunError(reason)
+        self._in_time = True
+
+    def move_fingers(self) -> None:
+        """Begin a motion of the fingers; raises as `begin` does."""
+        self.begin()
+        self._fingers_moved = True
 
 
 @dataclass(slots=True)
@@ -80,7 +89,7 @@ class OperatorAction:
         task.result()
 
     async def _unlock(self, permit: MotionPermit, *, confirmed: bool) -> None:
-        permit.take()
+        permit.begin()
         raise_if_refused(await self.robot.send(Unlock()))
         gripper = self.fingers.gripper
         if gripper is None:
@@ -88,13 +97,15 @@ class OperatorAction:
         try:
             # An activation opens and closes the fingers.
             with self.fingers.moving():
-                await gripper.unlock(permit.take, confirmed=confirmed)
+                await gripper.unlock(permit.move_fingers, confirmed=confirmed)
         except (ActionError, DriverError) as error:
-            raise ActionError(f"the robot is unlocked and may move again, and the gripper is not: {error}") from error
+            raise ActionError(
+                f"the robot is unlocked and may move again, and the gripper is not ready: {error}"
+            ) from error
 
     async def _release(self, permit: MotionPermit) -> None:
         gripper = self.fingers.gripper
         if gripper is None:
             return
         with self.fingers.moving():
-            await gripper.open_by_operator(permit.take)
+            await gripper.open_by_operator(permit.move_fingers)

@@ -75,9 +75,9 @@ class MessageStore:
         self.instance: str | None = None
         self.refused: Counter[str] = Counter()
         self._log = EventLog()
-        # The number of the stop that waits for its acknowledgement; the latest stop's number, run and times.
-        self._stop = 0
-        self._stop_times: tuple[int, int | None, str] = (0, None, "")
+        # Whether a stop waits for its acknowledgement; its run and its times.
+        self._stop_waits = False
+        self._stop_times: tuple[int | None, str] = (None, "")
 
     def add(self, topic: str, content: Mapping[str, Any], now_s: float) -> None:
         """Store one decoded message that arrived at `now_s`; count invalid ones by kind."""
@@ -140,14 +140,14 @@ class MessageStore:
             self._models[source] = str(content.get("model", ""))
             known = MODELS.get(self._models[source])
             return {"peaks": _peaks(content.get("scores")), "k_unit": known.k_unit if known is not None else ""}
-        if topic == LoopStop.topic:
-            self._stop_times = self._stop, content.get("run"), stop_times(content)
+        if topic == LoopStop.topic and self._stop_waits:
+            self._stop_times = content.get("run"), stop_times(content)
         if topic == LoopState.topic:
-            self._stop = int(content.get("stop") or 0)
-            number, run, times = self._stop_times
-            # The times of an earlier stop are not those of this one.
-            is_this_one = number == self._stop != 0 and run == content.get("run")
-            return {"stop_times": times if is_this_one else ""}
+            self._stop_waits = bool(content.get("stop"))
+            # An acknowledged stop's times are not those of the next one.
+            if not self._stop_waits or content.get("run") != self._stop_times[0]:
+                self._stop_times = (None, "")
+            return {"stop_times": self._stop_times[1]}
         k, sigma = content.get("k"), content.get("sigma")
         if topic == EitEstimate.topic and isinstance(k, float) and isinstance(sigma, float):
             model = self._models.get(source, "")

@@ -82,6 +82,8 @@ class RobotiqGripper:
     # The furthest position of the latest motion over this connection, and whether it has opened the fingers.
     _position: int | None = field(default=None, init=False)
     _opened: bool | None = field(default=None, init=False)
+    # The fault that an activation is to end: its reset alone hides the fault, and leaves a gripper that does not move.
+    _owed: messages.GripperFault | None = field(default=None, init=False)
 
     @property
     def model(self) -> GripperModel:
@@ -142,7 +144,8 @@ class RobotiqGripper:
                 return self._state(readout, t_ns)
             if not may_drop:
                 raise messages.GripperInactiveError(blocking)
-        # Both parts of the activation: a reset alone would only hide the fault.
+        if fault.needs_activation:
+            self._owed = fault
         await self._write(messages.GripperAction.RESET, permit)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
@@ -276,8 +279,11 @@ class RobotiqGripper:
 
     async def _read(self, *, whole: bool = False) -> _TimedReadout:
         self._latest = _TimedReadout(*await self._exchange(partial(self.client.read, whole=whole)))
+        readout = self._latest.readout
+        if readout.sta is messages.ActivationStatus.ACTIVE and not messages.fault_of(readout.flt).needs_activation:
+            self._owed = None
         self._requests.take(*self._latest)
-        self._follow(self._latest.readout.pos)
+        self._follow(readout.pos)
         self._news.set()
         self._news.clear()
         return self._latest
@@ -361,7 +367,7 @@ class RobotiqGripper:
             object=self._requests.object_status(readout),
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * messages.MA_PER_COUNT,
-            fault=messages.fault_of(readout.flt),
+            fault=self._owed or messages.fault_of(readout.flt),
             requested_counts=readout.pre,
             others_requests=self._requests.others,
             opened=self._opened,

@@ -30,3 +30,7 @@ class ActionError(Exception):
 
 class NotBegunError(ActionError):
     """An action was refused, and nothing has moved."""
+
+
+class NotContinuedError(ActionError):
+    """An action was refused after its first motion; something may still move."""

@@ -89,6 +89,13 @@ def test_a_slow_load_cell_is_known_between_its_readings():
     np.testing.assert_array_equal(np.isfinite(torque), ~gap & (t_s <= readings_s[-1]))
 
 
+@pytest.mark.parametrize("readings_s", [[0.0, 60.0], [0.0, 0.1, 60.0], [10.0 * one for one in range(12)]])
+def test_readings_that_are_far_apart_say_nothing_of_the_time_between(readings_s):
+    t_s = np.arange(0.3, readings_s[-1], 0.5)
+    torque = torque_at(t_s, np.array(readings_s), np.ones(len(readings_s)))
+    assert not np.isfinite(torque).any()
+
+
 def test_torque_at_frames_is_interpolated_and_never_extrapolated():
     np.testing.assert_array_equal(EMPTY.torque_at_frames(), [np.nan, 0.5, np.nan])
 

@@ -32,7 +32,7 @@ from shearloop.drivers.robotiq.messages import (
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers, GripperRegisters
-from shearloop.errors import ActionError, NotBegunError
+from shearloop.errors import ActionError, NotBegunError, NotContinuedError
 from shearloop.estimation.values import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 from tests.fixtures.daemons import DEADLINE_S
@@ -399,6 +399,31 @@ async def test_fingers_open_after_a_fault_although_a_request_fails_once(way, tmp
         await (task.unlock(confirmed=True) if command == "unlock" else task.open_by_operator())
         assert losses == []
         assert not task.status_of(await rig.driver.read()).may_hold
+
+
+@WAYS
+async def test_a_fault_lasts_until_the_activation_that_ends_it_is_complete(way, tmp_path):
+    """Its reset alone would hide it: the next unlock would acknowledge a gripper that does not move."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, _ = await holding(rig)
+        rig.model.fail(12)
+        asked: list[bool] = []
+
+        def permit() -> None:
+            asked.append(True)
+            if len(asked) == 2:
+                raise NotContinuedError("the daemon stood still")
+
+        with pytest.raises(NotContinuedError):
+            await task.unlock(permit, confirmed=True)
+        state = await rig.driver.read()
+        assert (state.fault.code, state.activation) == (12, ActivationStatus.RESET)
+        with pytest.raises(NotBegunError, match="confirm it with `shearloop command unlock --yes`"):
+            await task.unlock()
+        await task.unlock(confirmed=True)
+        state = await rig.driver.read()
+        assert (state.fault.code, state.activation) == (0, ActivationStatus.ACTIVE)
+        assert not task.status_of(state).may_hold
 
 
 @WAYS

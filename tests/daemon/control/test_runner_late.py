@@ -12,10 +12,11 @@ from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
-from shearloop.daemon.messaging.deadlines import Deadline
+from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.robotiq.gripper import Permit, permitted
+from shearloop.errors import NotBegunError
 from tests.daemon.control.cell import GRIP, TWIST, Cell, Gripper, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
@@ -225,13 +226,44 @@ async def test_a_release_is_in_time_by_the_beginning_of_its_motion(arrives_s, sa
 
 async def test_a_release_that_has_nothing_to_do_leaves_no_deadline_behind():
     """As where the fingers are open: nothing asks for the permit then."""
+    now_ns = 0
 
     class Open(Gripper):
         async def open_by_operator(self, _permit: Permit = permitted) -> None:
             self.asked.append("nothing to do")
 
     async with driven(cell=Cell(gripper=Open())) as cell:
-        assert await cell.runner.release(Deadline(1, 0, lambda: 0)) is None
+        assert await cell.runner.release(Deadline(10**9, 0, lambda: now_ns)) is None
+        now_ns = 10**12
         await cell.start(GRIP)
         await cell.until_done()
         assert cell.gripper.asked == ["nothing to do", "grip"]
+
+
+async def test_fingers_that_moved_before_a_refusal_are_halted_by_a_stop():
+    """The connection failed after the first motion, and its repetition is refused."""
+
+    async def stand_still(number: int) -> None:
+        cell.robot.bench.now_ns += number * 5_000_000_000
+
+    async with driven(cell=Cell(gripper=Slow(stand_still, motions=2))) as cell:
+        answered = asyncio.create_task(cell.runner.release())
+        while not answered.done():
+            await cell.cycles(1)
+        assert "the daemon stood still" in answered.result()
+        assert cell.runner.fingers.may_be_moving
+        cell.runner.stop(also_idle=True)
+        await cell.cycles(3)
+        assert cell.gripper.asked == ["open", "halt"]
+
+
+async def test_a_loop_that_crashed_and_came_back_late_lets_no_fingers_begin():
+    async with driven() as cell:
+        permit = cell.runner._permit(NO_DEADLINE)
+        cell.task.cancel()
+        await asyncio.wait([cell.task])
+        cell.robot.bench.now_ns += 5_000_000_000
+        cell.drive()
+        await cell.cycles(2)
+        with pytest.raises(NotBegunError, match=r"the daemon stood still for 5\.\d s"):
+            permit.move_fingers()

@@ -164,8 +164,9 @@ def test_a_heatmap_has_the_unit_of_k_of_its_model(model, unit):
 
 
 def test_a_stop_has_its_own_times_and_no_others():
-    """The times come some moments after the stop; a further cause, and a stop while nothing moves, have none."""
+    """The times come some moments after the stop. A further cause joins it, and the next stop has none of its own."""
     latest = MessageStore(3.6)
+    times = {"run": 1, "decided_after_s": 0.01, "sent_after_s": 0.02, "stands_after_s": 0.1}
 
     def shown(stop: int, run: int = 1) -> str:
         latest.add("loop.state", message("loop", stop=stop, run=run, phase="stopped"), 1.0)
@@ -173,8 +174,12 @@ def test_a_stop_has_its_own_times_and_no_others():
         return str(state["stop_times"])
 
     assert shown(1) == ""
-    latest.add("loop.stop", message("loop", run=1, decided_after_s=0.01, sent_after_s=0.02, stands_after_s=0.1), 1.0)
+    latest.add("loop.stop", message("loop", **times), 1.0)
     assert "standstill after 0.100 s" in shown(1)
-    assert shown(2) == "", "a further cause without an acknowledgement"
-    assert shown(0) == shown(3) == ""
-    assert shown(1, run=2) == ""
+    assert "standstill after 0.100 s" in shown(2), "a further press of STOP"
+    assert shown(0) == shown(3) == "", "acknowledged"
+    shown(0)
+    latest.add("loop.stop", message("loop", **times), 1.0)
+    assert shown(4) == "", "they came after the acknowledgement"
+    latest.add("loop.stop", message("loop", **times), 1.0)
+    assert shown(4, run=2) == ""

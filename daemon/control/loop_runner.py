@@ -293,7 +293,7 @@ class ControlLoopRunner:
         """
         if (reason := self.unlock_refusal()) is not None:
             return reason
-        permit = self._permit(deadline)
+        permit = self.permit(deadline)
         # A stop since the latest state is carried out and published as the stop that it is.
         self.decide_now()
         number = self._control_loop.safety.stop_number
@@ -306,7 +306,8 @@ class ControlLoopRunner:
         self._control_loop.acknowledge()
         return None
 
-    def _permit(self, deadline: Deadline) -> MotionPermit:
+    def permit(self, deadline: Deadline) -> MotionPermit:
+        """Return the permission of a motion that a person asks for now."""
         return MotionPermit(deadline, self._clock.now_ns(), self._why_stood_still)
 
     def _why_stood_still(self, since_ns: int) -> str | None:
@@ -340,7 +341,7 @@ class ControlLoopRunner:
         if (reason := self.release_refusal()) is not None:
             return reason
         try:
-            await self.operator_action.release(self._permit(deadline))
+            await self.operator_action.release(self.permit(deadline))
         except (ActionError, DriverError) as error:
             return str(error)
         self._control_loop.tool.on_release_ended()

@@ -259,7 +259,7 @@ async def test_fingers_that_moved_before_a_refusal_are_halted_by_a_stop():
 
 async def test_a_loop_that_crashed_and_came_back_late_lets_no_fingers_begin():
     async with driven() as cell:
-        permit = cell.runner._permit(NO_DEADLINE)
+        permit = cell.runner.permit(NO_DEADLINE)
         cell.task.cancel()
         await asyncio.wait([cell.task])
         cell.robot.bench.now_ns += 5_000_000_000

@@ -105,9 +105,8 @@ async def test_an_unlock_that_the_gripper_fails_says_what_was_unlocked_and_ackno
         unlocking = asyncio.create_task(cell.runner.unlock())
         while not unlocking.done():
             await cell.cycles(1)
-        said = (
-            "the robot is unlocked and may move again, the gripper is not ready: there is no connection to the gripper"
-        )
+        unlocked = "the robot is unlocked and may move again"
+        said = f"{unlocked}, and the gripper is not ready: there is no connection to the gripper"
         assert unlocking.result() == said
         said = "the operator stopped it: 'test' was under way. Send `shearloop command unlock` before the next start."
         assert cell.runner.start_refusal() == said

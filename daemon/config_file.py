@@ -33,20 +33,20 @@ class ConfigModel(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _no_number(cls, content: Any) -> Any:
-        # Pydantic takes true for 1, which may be the largest value allowed, and `true` for no number.
+    def _booleans_are_no_numbers(cls, content: Any) -> Any:
+        # Pydantic takes true for 1, which may be the largest value allowed. It takes the text `true` for no number.
         if not isinstance(content, Mapping):
             return content
-        return {key: cls._without_booleans(key, value) for key, value in content.items()}
+        return {key: cls._with_booleans_as_text(key, value) for key, value in content.items()}
 
     @classmethod
-    def _without_booleans(cls, key: Any, value: Any) -> Any:
+    def _with_booleans_as_text(cls, key: Any, value: Any) -> Any:
         annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
         if not (_holds(annotation, int) or _holds(annotation, float)) or _holds(annotation, bool):
             return value
         if isinstance(value, list):
-            return [_written(one) for one in value]
-        return _written(value)
+            return [_boolean_as_text(one) for one in value]
+        return _boolean_as_text(value)
 
     @field_validator("*")
     @classmethod
@@ -73,7 +73,7 @@ class ConfigModel(BaseModel):
                     yield from item.walk(path)
 
 
-def _written(value: object) -> object:
+def _boolean_as_text(value: object) -> object:
     """Return true and false as YAML writes them, and any other value as it is."""
     return str(value).lower() if isinstance(value, bool) else value
 

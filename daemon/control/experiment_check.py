@@ -80,8 +80,8 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
     These are the first `hold_torque` on an unidentified tool, a `tare` of a gripped one, a torque that undoes a
-    `tighten`, a `grip` wider than the one before it, and a limit below the torque that is held at the step's begin. No
-    limit above the `cap` is of use.
+    `tighten`, a `grip` wider than the one before it, and limits that the tool is beyond as the step begins. No limit
+    above the `cap` is of use.
     """
     found: list[Mistake] = [*_undoing(file), *_opening(file), *_begun_beyond_limits(file)]
     identified = gripped = False
@@ -124,8 +124,10 @@ def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap:
 
 def _begun_beyond_limits(file: ExperimentFile) -> Iterator[Mistake]:
     """Yield each step that may be stopped as it begins, because the tool is beyond its limits."""
+    if not is_whole(file):
+        return
     known = NOTHING_KNOWN
-    for number, step in enumerate(file.steps) if is_whole(file) else ():
+    for number, step in enumerate(file.steps):
         held_nm, limit_nm = known.torque_nm.exact, file.limits_of(step).torque_nm
         if held_nm is not None and abs(held_nm) >= limit_nm and not isinstance(step, ReleaseStep):
             yield (

@@ -81,7 +81,7 @@ class ControlLoopRunner:
         # When something that may have been moving ended.
         self._ended_ns: int | None = None
         self._decided_ns = 0
-        # Between two decisions: a longer time is a standstill, of which the latest ended at `_returned_ns`.
+        # A longer time between two decisions is a standstill; how long the latest one was, and when it ended.
         self._longest_pause_s = LONGEST_REST_S + control_loop.longest_hang_s
         self._stood_s, self._returned_ns = 0.0, 0
         # Counts the stops, also while an experiment starts.
@@ -129,7 +129,7 @@ class ControlLoopRunner:
         if experiment is not None:
             stopped = experiment.file.name
         elif not self.actions.finishing:
-            # After a motion that failed they may still move.
+            # Fingers may still move after a motion that failed.
             self.actions.halt_fingers()
         if stopped is not None or also_idle:
             what = f"{stopped!r} was under way" if stopped is not None else "nothing was under way"

@@ -132,7 +132,7 @@ class RobotiqGripper:
         activation is refused or fails: GripperInactiveError or GripperTooHotError if the object is the reason.
         """
         readout, t_ns = await self._recent()
-        fault = messages.fault_of(readout.flt)
+        fault = self._owed or messages.fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
                 raise messages.GripperFaultError(
@@ -167,7 +167,7 @@ class RobotiqGripper:
     async def move(self, command: messages.GripperCommand, permit: Permit = permitted) -> messages.GripperMove:
         """Start a motion, clipped to the limits, and return it as sent; `finish` waits for its end.
 
-        `permit` is asked as the request is sent: what was read before may have taken any time. Raises what it raises;
+        `permit` is asked as the request is sent: what was read before may have taken any time. Raises its error,
         GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
         """
         sent = self.request_of(command)

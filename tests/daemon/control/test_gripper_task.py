@@ -25,6 +25,7 @@ from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
     GripperCommand,
     GripperFault,
+    GripperFaultError,
     GripperMove,
     GripperState,
     ObjectStatus,
@@ -420,6 +421,8 @@ async def test_a_fault_lasts_until_the_activation_that_ends_it_is_complete(way, 
         assert (state.fault.code, state.activation) == (12, ActivationStatus.RESET)
         with pytest.raises(NotBegunError, match="confirm it with `shearloop command unlock --yes`"):
             await task.unlock()
+        with pytest.raises(GripperFaultError, match="An operator has to confirm that the fingers are clear"):
+            await rig.driver.activate(may_drop=True)
         await task.unlock(confirmed=True)
         state = await rig.driver.read()
         assert (state.fault.code, state.activation) == (0, ActivationStatus.ACTIVE)

@@ -340,6 +340,10 @@ def test_a_time_that_could_not_be_checked_is_called_probable(unsure_s, delay_s, 
     same = replace(calibration, torque=replace(model, regressor=replace(regressor, timing_widening=1.0)))
     said = " ".join(sentences_of(replace(result, calibration=same)))
     assert ("and the intervals of loaded frames do not allow for it. Record more" in said) == bool(unsure_s)
+    other = "b.mcap: --tool-mm 30, because the recording names its tool, of 20 mm"
+    mixed = replace(result, of_other_tools=[other])
+    assert f"Left out: {other}." in sentences_of(mixed)
+    assert mixed.figures()["tool_mm_left_out"] == [other]
     *_, common, few = sentences_of(replace(result, tools=[Measured(15.0, 0.0), Measured(30.0, 0.0)]))
     assert common == "The tools of 15 and 30 mm have the torque in common."
     assert few == "Diameters are not estimated: that takes recordings of three."

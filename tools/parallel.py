@@ -10,11 +10,11 @@ import shlex
 import signal
 import socket
 import sys
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from functools import partial
 from multiprocessing import active_children, get_context
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -62,17 +62,20 @@ class ProcessExecutor:
         pool = ProcessPoolExecutor(count, get_context("spawn"), initializer=_begin, initargs=(shared,))
         try:
             with interrupts_held():
-                results = pool.map(partial(_with_shared, function), items)
-            yield from results
+                tasks = deque(pool.submit(_with_shared, function, item) for item in items)
+            while tasks:
+                yield tasks.popleft().result()
             wanted = False
         except BrokenProcessPool as error:
             raise UserError("a process was killed, perhaps for lack of memory; run again with fewer --jobs") from error
         finally:
+            # No task is cancelled: before Python 3.12 the pool's own thread fails where it meets a cancelled task as
+            # its process dies.
             if wanted:
                 for process in active_children():
                     if process not in others:
                         process.terminate()
-            pool.shutdown(wait=True, cancel_futures=True)
+            pool.shutdown(wait=True)
 
 
 # What all tasks of this process share.

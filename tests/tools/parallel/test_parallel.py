@@ -6,6 +6,8 @@ import socket
 import sys
 import threading
 from multiprocessing import active_children
+from multiprocessing.connection import wait
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Any
 
@@ -106,11 +108,31 @@ def test_worker_processes_end_on_an_interrupt(number, more, tmp_path):
     thread = threading.Thread(target=interrupt)
     thread.start()
     with pytest.raises(KeyboardInterrupt), raise_ending_signals():
-        list(ProcessExecutor(1).map(waits, (str(tmp_path / "pids"), more), [0, 1, 2]))
+        list(ProcessExecutor(1).map(waits, (str(tmp_path / "pids"), more), range(30)))
     thread.join()
     assert active_children() == []
     with pytest.raises(ProcessLookupError):
         os.kill(running[0], 0)
+
+
+@pytest.mark.usefixtures("default_signals")
+def test_an_interrupt_ends_quietly_where_processes_die_before_anything_else_is_told(tmp_path, monkeypatch):
+    # As on a busy computer: the pool's own thread finds its dead process while it knows nothing of the interrupt.
+    terminate = SpawnProcess.terminate
+    monkeypatch.setattr(SpawnProcess, "terminate", lambda process: (terminate(process), wait([process.sentinel])))
+    os.mkfifo(tmp_path / "pids")
+
+    def interrupt() -> None:
+        """Interrupt this process as soon as a task waits."""
+        (tmp_path / "pids").read_text()
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt), raise_ending_signals():
+        list(ProcessExecutor(1).map(waits, (str(tmp_path / "pids"), ""), range(30)))
+    thread.join()
+    assert active_children() == []
 
 
 def test_a_tasks_error_is_raised(scheduler):

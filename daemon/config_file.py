@@ -3,21 +3,17 @@
 import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, TypeVar, get_args
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from shearloop.errors import UserError
 from shearloop.files import expanded_path
+from shearloop.models import booleans_as_text
 from shearloop.yaml_files import Document
 
 # No length of a tool, a grip or a lever is smaller.
 MIN_MM = 0.1
-
-
-def _holds(annotation: Any, kind: type) -> bool:
-    """Return whether a field may hold such a value, also in a list or as an alternative."""
-    return annotation is kind or any(_holds(one, kind) for one in get_args(annotation))
 
 
 class ConfigModel(BaseModel):
@@ -34,19 +30,7 @@ class ConfigModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _booleans_are_no_numbers(cls, content: Any) -> Any:
-        # Pydantic takes true for 1, which may be the largest value allowed. It takes the text `true` for no number.
-        if not isinstance(content, Mapping):
-            return content
-        return {key: cls._with_booleans_as_text(key, value) for key, value in content.items()}
-
-    @classmethod
-    def _with_booleans_as_text(cls, key: Any, value: Any) -> Any:
-        annotation = cls.model_fields[key].annotation if key in cls.model_fields else None
-        if not (_holds(annotation, int) or _holds(annotation, float)) or _holds(annotation, bool):
-            return value
-        if isinstance(value, list):
-            return [_boolean_as_text(one) for one in value]
-        return _boolean_as_text(value)
+        return booleans_as_text(content, {key: field.annotation for key, field in cls.model_fields.items()})
 
     @field_validator("*")
     @classmethod
@@ -71,11 +55,6 @@ class ConfigModel(BaseModel):
                 yield path, item
                 if isinstance(item, ConfigModel):
                     yield from item.walk(path)
-
-
-def _boolean_as_text(value: object) -> object:
-    """Return true and false as YAML writes them, and any other value as it is."""
-    return str(value).lower() if isinstance(value, bool) else value
 
 
 def _located(value: object, folder: Path) -> object:

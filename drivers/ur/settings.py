@@ -7,14 +7,16 @@ limit, so that no command reaches the hard one.
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal, get_type_hints
 
-from pydantic import Field
+from pydantic import Field, GetCoreSchemaHandler
+from pydantic_core.core_schema import CoreSchema, lax_or_strict_schema, no_info_before_validator_function
 
 from shearloop.drivers import ranges
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import is_loopback_host, why_no_address
 from shearloop.drivers.ur.poses import tool_axis
+from shearloop.models import booleans_as_text
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -106,10 +108,17 @@ GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
 
 
 class _Checked:
-    """Makes pydantic refuse unknown keys and numbers that are not finite, and describe keys by their docstrings."""
+    """Makes pydantic refuse unknown keys and what is no finite number, and describe keys by their docstrings."""
 
     __slots__ = ()
     __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False, "use_attribute_docstrings": True}
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Return the schema of a section, whose booleans are no numbers; they are none for a strict one anyway."""
+        types, strict = get_type_hints(source), handler(source)
+        lax = no_info_before_validator_function(lambda content: booleans_as_text(content, types), strict)
+        return lax_or_strict_schema(lax, strict)
 
 
 @dataclass(frozen=True, slots=True)

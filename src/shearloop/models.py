@@ -1,9 +1,9 @@
 """Loads outside data into pydantic models; `mistakes.py` describes what does not fit."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -28,3 +28,28 @@ def as_model(content: object, model: type[Model], folder: Path | None = None) ->
     """Return the content as a model; raises ValidationError. Its validators get the `folder`."""
     adapter: TypeAdapter[Model] = _adapter_of(model)
     return adapter.validate_python(content, context=folder and {"folder": folder})
+
+
+def booleans_as_text(content: object, types: Mapping[str, Any]) -> object:
+    """Return a section's content with each true or false as text where its key's type is a number.
+
+    Pydantic takes true for 1, which may be within the bounds. It takes the text `true` for no number.
+    """
+    if not isinstance(content, Mapping):
+        return content
+    return {key: _booleans_as_text(value) if _is_number(types.get(key)) else value for key, value in content.items()}
+
+
+def _is_number(annotation: Any) -> bool:
+    """Return whether a value may hold a number, also in a list or as an alternative, and no boolean."""
+    return (_holds(annotation, int) or _holds(annotation, float)) and not _holds(annotation, bool)
+
+
+def _holds(annotation: Any, kind: type) -> bool:
+    return annotation is kind or any(_holds(one, kind) for one in get_args(annotation))
+
+
+def _booleans_as_text(value: object) -> object:
+    if isinstance(value, list):
+        return [_booleans_as_text(one) for one in value]
+    return str(value).lower() if isinstance(value, bool) else value

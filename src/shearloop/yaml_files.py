@@ -4,7 +4,6 @@ Each caller names the exception to raise. Its message has a line for each mistak
 allowed: …; did you mean …?`. The modules that tell mistakes are imported where one is told.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +26,7 @@ class Document:
     content: Any
     raises: type[Exception]
     _root: yaml.Node | None
-    # What `with_values` was given as a number or as true or false: the text by its place in the content.
+    # What `with_values` was given as a number or as true or false: as it was written, by its place in the content.
     _given: Mapping[tuple[int | str, ...], str] = field(default_factory=dict)
 
     @classmethod
@@ -86,72 +85,28 @@ class Document:
             from shearloop.mistakes import first_key
 
             raise self.raises(f"{self.path}: expected keys and values such as `{first_key(model)}: …`")
-        content = self._with_expected_texts(model)
+        content, folder = self.content, self.path.resolve().parent
+        if self._given:
+            from shearloop.replaced_values import with_expected_texts
+
+            content = with_expected_texts(content, self._given, model, folder)
         try:
-            return as_model(content, model, self.path.resolve().parent)
+            return as_model(content, model, folder)
         except ValidationError as error:
             from shearloop.mistakes import mistake_lines
 
             lines = mistake_lines(error, model, content, str(self.path), self._root)
             raise self.raises("\n".join(lines)) from error
 
-    def _with_expected_texts(self, model: type[Any]) -> Any:
-        """Return the content with the values that were given as they were written, where the model expects a text."""
-        content, given = self.content, dict(self._given)
-        while given:
-            try:
-                as_model(content, model, self.path.resolve().parent)
-            except ValidationError as error:
-                places = [one["loc"] for one in error.errors() if one["type"] in ("string_type", "path_type")]
-            else:
-                break
-            texts = {place: given.pop(place) for place in places if place in given}
-            if not texts:
-                break
-            content = _with_texts(content, texts)
-        return content
-
     def with_values(self, values: Mapping[str, str]) -> Self:
         """Return the document with other values, given as YAML by their keys, such as `loop.kp` or `steps.0`.
 
-        Sections that are missing are made. A number is a text where a text is expected, as it is written: a shell takes
-        its quotes away. Mistakes in the result are named without a line.
+        Mistakes in the result are named without a line.
         """
-        content, given = copy.deepcopy(self.content), dict(self._given)
-        for key, text in values.items():
-            try:
-                value = yaml.load(text, Loader)  # noqa: S506 - it is a SafeLoader
-            except yaml.MarkedYAMLError as error:
-                from shearloop.yaml_mistakes import syntax
+        from shearloop.replaced_values import with_values
 
-                raise self.raises(f"{key}={text}: the value is not YAML: {syntax(error)}") from error
-            *sections, last = key.split(".")
-            section = content
-            for number, name in enumerate(sections):
-                section = self._section(section, name, ".".join(sections[:number]))
-            if isinstance(section, list):
-                section[self._index(section, last, ".".join(sections))] = value
-            elif isinstance(section, dict):
-                section[last] = value
-            else:
-                raise self.raises(f"{self.path}: {'.'.join(sections)} is a value, so it has no {last}")
-            if isinstance(value, bool | int | float):
-                given[tuple(int(part) if part.isdecimal() else part for part in key.split("."))] = text.strip()
-        return type(self)(self.path, content, self.raises, None, given)
-
-    def _section(self, section: Any, name: str, key: str) -> Any:
-        if isinstance(section, list):
-            return section[self._index(section, name, key)]
-        if not isinstance(section, dict):
-            raise self.raises(f"{self.path}: {key} is a value, so it has no {name}")
-        if section.get(name) is None:
-            section[name] = {}
-        return section[name]
-
-    def _index(self, section: list[Any], name: str, key: str) -> int:
-        if not (name.isdecimal() and int(name) < len(section)):
-            raise self.raises(f"{self.path}: {key} is a list of {len(section)}, so {name} is not one of its numbers")
-        return int(name)
+        content, given = with_values(self.content, values, self.path, self.raises)
+        return type(self)(self.path, content, self.raises, None, {**self._given, **given})
 
     def located(self, mistakes: Sequence[tuple[tuple[int | str, ...], str]]) -> list[str]:
         """Return `file:line: key: sentence` for each mistake, given by its location in the content."""
@@ -164,17 +119,6 @@ class Document:
             key, line = place_of(location, self.content, self._root, missing=True)
             found.append((line, f"{self.path}:{line}: {key}: {sentence}"))
         return [text for _, text in sorted(found)]
-
-
-def _with_texts(content: Any, texts: Mapping[tuple[int | str, ...], str]) -> Any:
-    """Return the content with these texts at their places."""
-    changed = copy.deepcopy(content)
-    for place, text in texts.items():
-        section = changed
-        for part in place[:-1]:
-            section = section[part]
-        section[place[-1]] = text
-    return changed
 
 
 def read_yaml(path: Path, raises: type[Exception], what: str = "configuration", cure: str = "") -> Any:

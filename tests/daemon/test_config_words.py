@@ -1,21 +1,25 @@
 """What people write in a configuration is answered in its own words: quotes, names, addresses, hosts and paths."""
 
+import importlib
 import re
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
+from pydantic import ValidationError
 
+from shearloop.cli.config_schema import MODELS, schema_of
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers import name_look_up
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hosts import why_no_address, why_no_host
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
+from shearloop.models import as_model
 
 PORT = "{path: port}"
 
@@ -47,6 +51,38 @@ def test_a_boolean_for_a_number_hides_no_other_mistake(tmp_path):
     assert [line.rpartition("config.yaml:")[2].split(": ")[:2] for line in said.splitlines()] == [
         ["3", "loop.kp"], ["4", "loop.kq"], ["5", "loop.ki"],
     ]  # fmt: skip
+
+
+def with_true(schema: Any, section: Any) -> Iterator[Any]:
+    """Yield the content of a section with true in the place of one number, for each number."""
+    if "$ref" in section:
+        section = schema["$defs"][section["$ref"].rpartition("/")[2]]
+    if section.get("type") in ("number", "integer"):
+        yield True
+    for one in (*section.get("anyOf", ()), *section.get("oneOf", ())):
+        yield from with_true(schema, one)
+    keys = dict(section.get("properties", {}))
+    for described in section.get("patternProperties", {}).values():
+        keys["name"] = described
+    kind = {"do": keys["do"]["const"]} if "do" in keys else {}
+    for key, described in keys.items():
+        for value in with_true(schema, described):
+            yield {**kind, key: value}
+    for number, entry in enumerate(section.get("prefixItems") or filter(None, [section.get("items")])):
+        for value in with_true(schema, entry):
+            yield [0] * number + [value]
+
+
+@pytest.mark.parametrize("kind", MODELS)
+def test_every_number_of_a_file_refuses_true(kind):
+    schema = schema_of(kind)
+    contents = list(with_true(schema, schema))
+    assert len(contents) > 5
+    module, name = MODELS[kind]
+    for content in contents:
+        with pytest.raises(ValidationError) as refused:
+            as_model(content, getattr(importlib.import_module(module), name))
+        assert any(mistake["input"] == "true" for mistake in refused.value.errors()), content
 
 
 @pytest.mark.parametrize("key", ["publish", "commands"])

@@ -316,12 +316,18 @@ class RobotiqGripper:
                 return self._latest
         return await self._read()
 
-    async def _write(self, request: messages.Request, permit: Permit = permitted) -> None:
+    async def _write(self, request: messages.Request, permit: Permit | None = None) -> None:
+        """Send a request. One with a permit is not sent where its caller is cancelled before."""
+
         def before() -> None:
-            permit()
+            if permit is not None:
+                if sending.cancelled():
+                    raise asyncio.CancelledError
+                permit()
             self._note(request)
 
-        await self._exchange(partial(self.client.write, request, before))
+        sending = self._exchange(partial(self.client.write, request, before))
+        await sending
         # A readout may have come before the write.
         self._latest = None
 
@@ -336,7 +342,7 @@ class RobotiqGripper:
         else:
             self._requests.on_action(t_ns)
 
-    async def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
+    def _exchange(self, exchange: Callable[[], Awaitable[T]]) -> asyncio.Future[tuple[T, int]]:
         """Return an exchange's result and its beginning. It goes on when its caller is cancelled.
 
         Breaking it off would cost the connection.
@@ -344,7 +350,7 @@ class RobotiqGripper:
         task = asyncio.ensure_future(self._locked(exchange))
         # `states` reports a failure that comes after its caller was cancelled.
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
-        return await asyncio.shield(task)
+        return asyncio.shield(task)
 
     async def _locked(self, exchange: Callable[[], Awaitable[T]]) -> tuple[T, int]:
         """Exclude other exchanges, and note a loss, which `states` reports."""

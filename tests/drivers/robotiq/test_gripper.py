@@ -167,6 +167,62 @@ async def test_a_request_that_is_not_permitted_any_more_as_it_is_sent_changes_no
         assert rig.model.width_mm == pytest.approx(30.0, abs=1.0)
 
 
+@pytest.mark.parametrize(
+    ("way", "activates", "polls"),
+    [
+        ("socket", False, True),
+        ("socket", True, True),
+        ("modbus", False, True),
+        ("modbus", True, True),
+        # A move over Modbus is preceded by a reading of its own.
+        ("modbus", False, False),
+    ],
+)
+async def test_a_request_that_is_called_off_before_it_is_sent_changes_nothing(way, activates, polls, tmp_path):
+    """A stop comes while the gripper still answers a question, for which the request waits."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        command, read = rig.model.command, rig.driver.client.read
+        asked, answers, reads = asyncio.Event(), asyncio.Event(), 0
+
+        async def read_at_length(*, whole: bool = False) -> messages.Readout:
+            nonlocal reads
+            reads += 1
+            if reads == 2:
+                asked.set()
+                await answers.wait()
+            return await read(whole=whole)
+
+        rig.driver.client.read = read_at_length
+        closing = messages.GripperCommand(20.0)
+        act = rig.driver.activate(operator_confirmed=True) if activates else rig.driver.move(closing)
+        moving = asyncio.create_task(act)
+        polling = asyncio.create_task(rig.driver.poll() if polls else asked.wait())
+        await asked.wait()
+        for _ in range(100):
+            await asyncio.sleep(0)
+        moving.cancel()
+        answers.set()
+        await asyncio.wait([moving, polling])
+        assert moving.cancelled()
+        await rig.driver.read()
+        assert rig.model.command == command
+        assert rig.driver.connected
+
+
+@WAYS
+async def test_a_halt_that_is_called_off_is_sent(way, tmp_path):
+    """The end of the daemon does not wait for it for ever, and the fingers may not go on."""
+    async with a_rig(way, tmp_path, active=True) as rig:
+        await rig.driver.move(messages.GripperCommand(0.0, speed_mm_per_s=30.0))
+        polling = asyncio.create_task(rig.driver.poll())
+        halting = asyncio.create_task(rig.driver.halt())
+        await asyncio.sleep(0)
+        halting.cancel()
+        await asyncio.wait([polling, halting])
+        await rig.driver.read()
+        assert not rig.model.command.gto
+
+
 @WAYS
 async def test_a_halt_right_after_a_reset_activates_nothing(way, tmp_path):
     """The status shows the reset only after the next step."""

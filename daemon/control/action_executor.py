@@ -24,6 +24,7 @@ from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import LONGEST_TARE_S, Adaptable, Tareable
 from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.gripper import Permit
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import ZeroForceTorque
 from shearloop.errors import ActionError, NotBegunError
@@ -58,9 +59,9 @@ class ActionExecutor:
         """Whether the last release or halt of a stop is under way."""
         return self._final_task is not None and not self._final_task.done()
 
-    def begin(self, action: Action) -> None:
-        """Carry out an action, and report its end to the control loop."""
-        self._start(action.do, partial(self._run, action), self.control_loop.on_action_ended)
+    def begin(self, action: Action, permit: Permit) -> None:
+        """Carry out an action, and report its end to the control loop; `permit` is asked before each motion."""
+        self._start(action.do, partial(self._run, action, permit), self.control_loop.on_action_ended)
 
     def release(self) -> None:
         """Open the gripper after a stop."""
@@ -125,16 +126,17 @@ class ActionExecutor:
 
     def _on_halted(self, error: str | None) -> None:
         if error is not None:
+            self.fingers.may_be_moving = True
             detail = f"the fingers did not stop, keep clear of them: {error}"
             self.control_loop.on_fault(FaultCode.COMMAND_REFUSED, detail)
 
-    async def _run(self, action: Action) -> None:
+    async def _run(self, action: Action, permit: Permit) -> None:
         """Carry out an action; raises DriverError and ActionError."""
         match action:
             case ApproachStep():
-                await self.straight_moves.carry_out(action)
+                await self.straight_moves.carry_out(action, permit)
             case GripStep():
-                await self._grip(action)
+                await self._grip(action, permit)
             case TareStep():
                 await self._tare(action)
             case AdaptStep():
@@ -145,15 +147,15 @@ class ActionExecutor:
             case IdentifyStep():
                 raise TypeError("the control loop identifies by itself")
 
-    async def _grip(self, action: GripStep) -> None:
+    async def _grip(self, action: GripStep, permit: Permit) -> None:
         gripper = self.fingers.gripper
         if gripper is None:
             raise ActionError("no gripper is configured; add a `gripper` section to the configuration")
         try:
             if not isinstance(action, Opening):
                 await self._write_new_grip()
-            with self.fingers.moving():
-                await gripper.grip(action)
+            with self.fingers.moving(permit) as begin:
+                await gripper.grip(action, begin)
         except NotBegunError:
             self.control_loop.tool.on_grip_refused()
             raise

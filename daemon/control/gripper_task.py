@@ -27,7 +27,7 @@ from shearloop.drivers.robotiq.messages import (
     ObjectStatus,
 )
 from shearloop.drivers.robotiq.models import LARGEST_STROKE_MM
-from shearloop.errors import ActionError, NotBegunError, NotContinuedError
+from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation import Measured, combine
 from shearloop.estimation.values import TWO_SIDED_95
 
@@ -88,7 +88,7 @@ class GripperTask:
                 ) from error
             state, width_mm = await self.gripper.read(), target.width_mm
             if not isinstance(target, Opening):
-                self._refuse_to_open(target, state)
+                self._refuse_to_open(target, state, permit)
             elif self._is_open(target, state):
                 self.gripper.take_as_open()
                 self._take(replace(state, opened=True))
@@ -123,14 +123,17 @@ class GripperTask:
         gripped = state.opened is False or self.control_loop.tool.was_gripped
         return state.object is not ObjectStatus.AT_TARGET or (self._unfelt(state) and gripped)
 
-    def _refuse_to_open(self, target: GripStep, state: GripperState) -> None:
+    def _refuse_to_open(self, target: GripStep, state: GripperState, permit: Permit) -> None:
         """Raise ActionError where a grip would open the fingers and drop something, NotBegunError where they rest."""
         may_hold = state.object is not ObjectStatus.AT_TARGET or self._unfelt(state)
         # In counts: the fingers may stand less than one count from the target.
         opens = self.gripper.calibration.counts(target.width_mm) < state.position_counts
         if opens and may_hold and (self._holds(state) or not self._nearly_open(state)):
-            # Fingers that another program moves have to be halted.
-            refused = ActionError if state.object is ObjectStatus.MOVING else NotBegunError
+            refused: type[ActionError] = NotBegunError
+            if state.object is ObjectStatus.MOVING:
+                # Fingers that another program moves are halted too.
+                permit()
+                refused = ActionError
             raise refused(
                 f"the fingers are {state.width_mm:.1f} mm apart and hold something, or may hold it, and a grip to "
                 f"{target.width_mm:g} mm would open them and drop it; put a `release` before it, or correct `width_mm`"
@@ -273,7 +276,7 @@ async def _tried(act: Callable[[], Awaitable[None]]) -> None:
     while True:
         try:
             return await act()
-        except (NotBegunError, NotContinuedError):
+        except NotBegunError:
             # What is refused for a reason does not begin later by itself.
             raise
         except (ActionError, DriverError):

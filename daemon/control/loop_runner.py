@@ -398,7 +398,7 @@ class ControlLoopRunner:
                 self._may_be_moving = True
                 self.straight_moves.go_on()
                 if action is not None:
-                    self.actions.begin(action)
+                    self.actions.begin(action, self.permit(NO_DEADLINE).begin)
                 self._sender.turn(rad_per_s, now_ns)
             case StandStill():
                 self._may_be_moving = True

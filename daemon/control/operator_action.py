@@ -12,7 +12,7 @@ from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
-from shearloop.errors import ActionError, NotBegunError, NotContinuedError
+from shearloop.errors import ActionError, NotBegunError
 
 UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 
@@ -29,22 +29,13 @@ class MotionPermit:
     given_ns: int
     why_stood_still: Callable[[int], str | None]
     _in_time: bool = False
-    _fingers_moved: bool = False
 
     def begin(self) -> None:
-        """Begin the action, or go on with it; raises where it is no longer what the person wants.
-
-        NotBegunError before the fingers have moved, NotContinuedError after that.
-        """
+        """Begin a motion, or the next one; raises NotBegunError where it is no longer what the person wants."""
         late = None if self._in_time else self.deadline.why_passed("reaching the robot or the gripper")
         if (reason := late or self.why_stood_still(self.given_ns)) is not None:
-            raise NotContinuedError(reason) if self._fingers_moved else NotBegunError(reason)
+            raise NotBegunError(reason)
         self._in_time = True
-
-    def move_fingers(self) -> None:
-        """Begin a motion of the fingers; raises as `begin` does."""
-        self.begin()
-        self._fingers_moved = True
 
 
 @dataclass(slots=True)
@@ -96,8 +87,8 @@ class OperatorAction:
             return
         try:
             # An activation opens and closes the fingers.
-            with self.fingers.moving():
-                await gripper.unlock(permit.move_fingers, confirmed=confirmed)
+            with self.fingers.moving(permit.begin) as begin:
+                await gripper.unlock(begin, confirmed=confirmed)
         except (ActionError, DriverError) as error:
             raise ActionError(
                 f"the robot is unlocked and may move again, and the gripper is not ready: {error}"
@@ -107,5 +98,5 @@ class OperatorAction:
         gripper = self.fingers.gripper
         if gripper is None:
             return
-        with self.fingers.moving():
-            await gripper.open_by_operator(permit.move_fingers)
+        with self.fingers.moving(permit.begin) as begin:
+            await gripper.open_by_operator(begin)

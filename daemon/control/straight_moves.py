@@ -1,6 +1,7 @@
 """Straight moves of the arm, which the control loop interrupts and lets continue."""
 
 import asyncio
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -47,8 +48,8 @@ class StraightMoves:
         self._interrupted = self._interrupted or stop
         return stop
 
-    async def carry_out(self, step: ApproachStep) -> None:
-        """Move to the end of the step; raises DriverError and ActionError."""
+    async def carry_out(self, step: ApproachStep, permit: Callable[[], None]) -> None:
+        """Move to the end of the step; raises DriverError, ActionError, and what `permit` raises."""
         pose = step.pose_m_rad
         while True:
             await self._may_go_on.wait()
@@ -62,6 +63,7 @@ class StraightMoves:
             # The goal is fixed at the first start, so that an interruption does not lengthen the move.
             pose = pose or along_tool(here.tcp_pose, step.along_tool_m or 0.0)
             command = MoveLinear(pose, step.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
+            permit()
             self._under_way, self._interrupted = True, False
             try:
                 end, reason = await self._move_once(command, here.motion_id)

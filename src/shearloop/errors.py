@@ -29,8 +29,4 @@ class ActionError(Exception):
 
 
 class NotBegunError(ActionError):
-    """An action was refused, and nothing has moved."""
-
-
-class NotContinuedError(ActionError):
-    """An action was refused after its first motion; something may still move."""
+    """An action was refused before its motion, or before the next one."""

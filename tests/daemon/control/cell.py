@@ -24,6 +24,7 @@ from shearloop.drivers.robotiq.gripper import Permit, permitted
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Heartbeat, MoveLinear, RobotState, WristSpeed
 from shearloop.drivers.ur.settings import WRENCH_STATES
+from shearloop.errors import NotBegunError
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS, FakeArm, HandlerBench
 
 SPEED_M_PER_S = 0.1
@@ -149,7 +150,8 @@ class Gripper:
         self.asked: list[str] = []
 
     async def grip(self, _wish: GripStep, permit: Permit = permitted) -> None:
-        permit()
+        if not isinstance(self.error, NotBegunError):
+            permit()
         self.asked.append("grip")
         await self.there.wait()
         if self.error is not None:

@@ -33,7 +33,7 @@ from shearloop.drivers.robotiq.messages import (
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
 from shearloop.emulators.gripper import Fingers, GripperRegisters
-from shearloop.errors import ActionError, NotBegunError, NotContinuedError
+from shearloop.errors import ActionError, NotBegunError
 from shearloop.estimation.values import TWO_SIDED_95
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 from tests.fixtures.daemons import DEADLINE_S
@@ -341,6 +341,23 @@ async def test_a_grip_never_drops_what_is_held(way, tmp_path):
 
 
 @WAYS
+async def test_fingers_that_another_program_moves_count_as_moving_where_a_grip_is_refused(way, tmp_path):
+    """So the end of the experiment halts them."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, _ = await holding(rig)
+        rig.model.object_mm = None
+        rig.model.write(replace(rig.model.command, pos=255, spe=0))
+        while (await rig.driver.read()).object is not ObjectStatus.MOVING:
+            pass
+        rig.stopped = True
+        asked: list[bool] = []
+        with pytest.raises(ActionError, match="would open them and drop it") as refused:
+            await task.grip(replace_step(GRIP, width_mm=60.0), lambda: asked.append(True))
+        assert not isinstance(refused.value, NotBegunError), "what was gripped may be no more"
+        assert asked == [True]
+
+
+@WAYS
 async def test_a_hot_gripper_refuses_a_grip_and_opens_for_a_release(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         task, held_mm = await holding(rig)
@@ -413,9 +430,9 @@ async def test_a_fault_lasts_until_the_activation_that_ends_it_is_complete(way, 
         def permit() -> None:
             asked.append(True)
             if len(asked) == 2:
-                raise NotContinuedError("the daemon stood still")
+                raise NotBegunError("the daemon stood still")
 
-        with pytest.raises(NotContinuedError):
+        with pytest.raises(NotBegunError):
             await task.unlock(permit, confirmed=True)
         state = await rig.driver.read()
         assert (state.fault.code, state.activation) == (12, ActivationStatus.RESET)

@@ -131,7 +131,7 @@ async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_firs
 async def test_a_stop_ends_unlocking_and_stops_the_fingers():
     async with driven() as cell:
         cell.gripper.there.clear()
-        unlocking = asyncio.create_task(cell.runner.unlock())
+        unlocking = asyncio.create_task(cell.runner.unlock(confirmed=True))
         await cell.cycles(5)
         starting = asyncio.create_task(cell.runner.start(experiment(GRIP)))
         await cell.cycles(5)
@@ -139,9 +139,21 @@ async def test_a_stop_ends_unlocking_and_stops_the_fingers():
         assert cell.runner.stop() == "unlock"
         await cell.cycles(5)
         assert "unlocking was stopped" in await unlocking
-        assert cell.gripper.asked == ["halt"]
+        assert cell.gripper.asked == ["activate", "halt"]
         assert cell.robot.commands[-1] == Stop(LoopConfig().wrist_acceleration_rad_per_s2), "it ends the robot's part"
         assert cell.runner.stop() is None
+
+
+async def test_a_stop_before_the_fingers_were_asked_to_move_halts_nothing():
+    """As where the gripper is still being read. A halted gripper does not know any more whether it holds something."""
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        unlocking = asyncio.create_task(cell.runner.unlock())
+        await cell.cycles(5)
+        assert cell.runner.stop() == "unlock"
+        await cell.cycles(5)
+        assert "unlocking was stopped" in await unlocking
+        assert cell.gripper.asked == []
 
 
 async def test_the_state_warns_of_fingers_that_could_not_be_stopped(monkeypatch):
@@ -150,8 +162,13 @@ async def test_the_state_warns_of_fingers_that_could_not_be_stopped(monkeypatch)
         async def does_not() -> None:
             raise DriverError("the gripper does not answer")
 
-        monkeypatch.setattr(cell.gripper, "halt", does_not)
-        cell.runner.stop()
-        await cell.cycles(20)
+        with monkeypatch.context() as failing:
+            failing.setattr(cell.gripper, "halt", does_not)
+            cell.runner.stop()
+            await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
         assert any("keep clear of them: the gripper does not answer" in one for one in reasons)
+        # They may move still.
+        cell.runner.stop()
+        await cell.cycles(20)
+        assert cell.gripper.asked == ["grip", "halt"]

@@ -7,17 +7,21 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control import fault_detection
+from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
+from shearloop.daemon.control.experiment_schema import GripStep
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
 from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
+from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import Permit, permitted
+from shearloop.drivers.ur.messages import MoveLinear
 from shearloop.errors import NotBegunError
-from tests.daemon.control.cell import GRIP, TWIST, Cell, Gripper, driven
+from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, Gripper, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
 
 
@@ -257,6 +261,21 @@ async def test_fingers_that_moved_before_a_refusal_are_halted_by_a_stop():
         assert cell.gripper.asked == ["open", "halt"]
 
 
+async def test_fingers_of_a_failed_motion_are_halted_by_a_stop_although_the_next_one_was_refused():
+    """Its connection was lost in the middle, and the next command came too late to begin anything."""
+    async with driven() as cell:
+        cell.gripper.error = DriverError("the connection to the gripper broke")
+        releasing = asyncio.create_task(cell.runner.release())
+        await cell.cycles(2)
+        assert "broke" in releasing.result()
+        releasing = asyncio.create_task(cell.runner.release(Deadline(0, 0, lambda: 10**9)))
+        await cell.cycles(2)
+        assert "the request had expired" in releasing.result()
+        cell.runner.stop()
+        await cell.cycles(2)
+        assert cell.gripper.asked == ["open", "halt"]
+
+
 async def test_a_loop_that_crashed_and_came_back_late_lets_no_fingers_begin():
     async with driven() as cell:
         permit = cell.runner.permit(NO_DEADLINE)
@@ -266,4 +285,35 @@ async def test_a_loop_that_crashed_and_came_back_late_lets_no_fingers_begin():
         cell.drive()
         await cell.cycles(2)
         with pytest.raises(NotBegunError, match=r"the daemon stood still for 5\.\d s"):
-            permit.move_fingers()
+            permit.begin()
+
+
+async def test_no_step_begins_to_close_the_fingers_after_the_daemon_stood_still():
+    """The gripper's answer is taken before the loop decides again."""
+
+    class Asked(Gripper):
+        async def grip(self, wish: GripStep, permit: Permit = permitted) -> None:
+            cell.robot.bench.now_ns += 5_000_000_000
+            await super().grip(wish, permit)
+
+    async with driven(cell=Cell(gripper=Asked())) as cell:
+        await cell.start(GRIP)
+        await cell.until_ended()
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert "stood still for 5.0 s" in cell.why
+        assert cell.gripper.asked == []
+
+
+async def test_no_straight_move_begins_after_the_daemon_stood_still(monkeypatch):
+    """The state that shows the arm at rest is taken before the loop decides again."""
+
+    async def stand_still(_: CommandSender) -> None:
+        cell.robot.bench.now_ns += 5_000_000_000
+
+    async with driven() as cell:
+        monkeypatch.setattr(CommandSender, "wait_for_rest", stand_still)
+        await cell.start(MOVE)
+        await cell.until_ended()
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert "stood still for 5.0 s" in cell.why
+        assert not any(isinstance(command, MoveLinear) for command in cell.robot.commands)

@@ -6,6 +6,9 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.control.faults import FaultCode
+from shearloop.daemon.control.loop_runner import ControlLoopRunner
+from shearloop.daemon.control.operator_action import MotionPermit
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.fixtures.rigs import SLOW_TWIST, experiment, pendant, running_rig, started
 
@@ -142,7 +145,14 @@ async def test_a_release_from_before_the_daemon_stood_still_opens_nothing(rig_co
             time.sleep(1.0)  # noqa: ASYNC251 - the process stands still
             return await read(client, **given)
 
-        monkeypatch.setattr(SocketClient, "read", read_late)
+        permit = ControlLoopRunner.permit
+
+        def permit_before_standstill(runner: ControlLoopRunner, deadline: Deadline) -> MotionPermit:
+            monkeypatch.setattr(ControlLoopRunner, "permit", permit)
+            monkeypatch.setattr(SocketClient, "read", read_late)
+            return permit(runner, deadline)
+
+        monkeypatch.setattr(ControlLoopRunner, "permit", permit_before_standstill)
         until_ns = daemon.commands.now_ns() + 500_000_000
         reply = await command("release", confirmed=True, until_ns=until_ns)
         assert not reply["ok"], reply

@@ -19,7 +19,7 @@ from shearloop.daemon.messaging.messages import LoopStop
 from shearloop.daemon.torques import WRENCH
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import Permit, permitted
-from shearloop.drivers.ur.messages import MoveLinear
+from shearloop.drivers.ur.messages import MoveLinear, Unlock
 from shearloop.errors import NotBegunError
 from tests.daemon.control.cell import GRIP, MOVE, TWIST, Cell, Gripper, driven
 from tests.drivers.ur.handler_bench import CYCLE_NS, SETTINGS
@@ -259,6 +259,14 @@ async def test_fingers_that_moved_before_a_refusal_are_halted_by_a_stop():
         cell.runner.stop(also_idle=True)
         await cell.cycles(3)
         assert cell.gripper.asked == ["open", "halt"]
+
+
+async def test_an_unlock_that_has_expired_reaches_no_robot():
+    async with driven() as cell:
+        unlocking = asyncio.create_task(cell.runner.unlock(Deadline(0, 0, lambda: 10**9)))
+        await cell.cycles(2)
+        assert "the request had expired" in unlocking.result()
+        assert Unlock() not in cell.robot.commands
 
 
 async def test_fingers_of_a_failed_motion_are_halted_by_a_stop_although_the_next_one_was_refused():

@@ -55,6 +55,10 @@ class Clock:
         """Return CLOCK_MONOTONIC in nanoseconds."""
         return time.monotonic_ns()
 
+    def suspended_ns(self) -> int:
+        """Return how long the computer was suspended since it started, in nanoseconds."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+
     def unix_s(self, t_mono_ns: int) -> float:
         """Return the Unix time, in seconds, of a reading of the monotonic clock."""
         return (t_mono_ns + self.offset_ns) / 1e9
@@ -75,8 +79,7 @@ class Clock:
         return ClockStep.between(before, self._reading)
 
     def _measured(self) -> ClockReading:
-        mono_ns = time.monotonic_ns()
-        return ClockReading(time.time_ns() - mono_ns, time.clock_gettime_ns(time.CLOCK_BOOTTIME) - mono_ns)
+        return ClockReading(time.time_ns() - time.monotonic_ns(), self.suspended_ns())
 
 
 def _beyond_step(change_s: float) -> float:

@@ -70,25 +70,17 @@ class ActionExecutor:
             self._final_task = self._start("open", gripper.release, self.control_loop.tool.on_release_ended)
 
     def cancel(self) -> None:
-        """Cancel the present action; moving fingers are halted."""
+        """Cancel the present action, unless it is the last one of a stop; moving fingers are halted."""
         gripper, may_be_moving = self.fingers.gripper, self.fingers.may_be_moving
         self.fingers.may_be_moving = False
         if may_be_moving and gripper is not None:
             self._final_task = self._start("halt", gripper.halt, self._on_halted)
-        elif self._task is not None:
+        elif self._task is not None and self._task is not self._final_task:
             self._task.cancel()
 
     def halt_fingers(self) -> None:
         """Halt the fingers if they may be moving, which cancels the present action."""
         if self.fingers.may_be_moving:
-            self.cancel()
-
-    def abort(self) -> None:
-        """Cancel the present action unless it is the last one of a stop.
-
-        Before the stop: the action may be about to start a straight move.
-        """
-        if self._task is not self._final_task:
             self.cancel()
 
     async def wait_for_final_action(self) -> None:

@@ -16,7 +16,7 @@ from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.inputs import ArmStatus
-from shearloop.daemon.control.operator_action import UNLOCKING, MotionPermit, OperatorAction
+from shearloop.daemon.control.operator_action import MotionPermit, OperatorAction
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves
@@ -41,6 +41,7 @@ BRAKE_S = 0.5
 # The robot confirms `Enable` in one of its next states.
 ENABLED_WITHIN_S = 0.5
 ENDING = "the daemon ends; start it again"
+UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
 STOPPED_AT_START = "it was stopped during its start"
 # An operator who sends a stop may not have seen yet that the experiment has ended by itself.
 UNSEEN_S = 5.0
@@ -109,7 +110,8 @@ class ControlLoopRunner:
         except Exception as error:
             self._running = False
             self._control_loop.on_fault(FaultCode.TASK_DIED, f"loop: {error_text(error)}")
-            self.actions.abort()
+            # Before the stop: the action may be about to start a straight move.
+            self.actions.cancel()
             await self._brake()
             # Without this wait the gripper might not receive its final command.
             await self.halt_and_wait()
@@ -128,7 +130,7 @@ class ControlLoopRunner:
         experiment, stopped = self._control_loop.running_experiment, self._stop_operator_action()
         if experiment is not None:
             stopped = experiment.file.name
-        elif not self.actions.finishing:
+        else:
             # Fingers may still move after a motion that failed.
             self.actions.halt_fingers()
         if stopped is not None or also_idle:
@@ -308,12 +310,19 @@ class ControlLoopRunner:
 
     def permit(self, deadline: Deadline) -> MotionPermit:
         """Return the permission of a motion that a person asks for now."""
-        return MotionPermit(deadline, self._clock.now_ns(), self._why_stood_still)
+        given_ns, suspended_ns = self._clock.now_ns(), self._clock.suspended_ns()
+        return MotionPermit(deadline, lambda: self._why_stood_still(given_ns, suspended_ns))
 
-    def _why_stood_still(self, since_ns: int) -> str | None:
-        """Return why a person who asked for a motion at `since_ns` may be at the robot by now, or None."""
+    def _why_stood_still(self, since_ns: int, suspended_ns: int) -> str | None:
+        """Return why a person who asked for a motion at `since_ns` may be at the robot by now, or None.
+
+        `suspended_ns` is how long the computer had been suspended then.
+        """
+        suspended_s = (self._clock.suspended_ns() - suspended_ns) / 1e9
         stands_s = (self._clock.now_ns() - self._decided_ns) / 1e9
-        if self._running and stands_s > self._longest_pause_s:
+        if suspended_s > self._longest_pause_s:
+            stood_s = suspended_s
+        elif self._running and stands_s > self._longest_pause_s:
             stood_s = stands_s
         elif self._returned_ns > since_ns:
             stood_s = self._stood_s
@@ -348,10 +357,9 @@ class ControlLoopRunner:
         return None
 
     def _stop_operator_action(self) -> str | None:
-        """End an unlocking or a release, and halt the fingers that it moves; return the command's name, or None."""
+        """End an unlocking or a release, but not the fingers that it moves; return the command's name, or None."""
         stopped = self.operator_action.stop()
         if stopped is not None:
-            self.actions.halt_fingers()
             # The worker ends its part.
             self._robot.send(self._sender.stop_command)
         return stopped

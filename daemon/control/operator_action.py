@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 from shearloop.daemon.control.command_sender import raise_if_refused
@@ -14,33 +13,29 @@ from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Unlock
 from shearloop.errors import ActionError, NotBegunError
 
-UNLOCKING = "robot and gripper are being unlocked, or the gripper opened; wait for the end"
-
 
 @dataclass(slots=True)
 class MotionPermit:
     """A person's permission of a motion: until it expires, and as long as the daemon does not stand still.
 
-    What has begun in time does not expire. `given_ns` is CLOCK_MONOTONIC; `why_stood_still` says whether the daemon
-    stood still since then.
+    What has begun in time does not expire. `why_stood_still` says whether the daemon stood still since it was given.
     """
 
     deadline: Deadline
-    given_ns: int
-    why_stood_still: Callable[[int], str | None]
+    why_stood_still: Callable[[], str | None]
     _in_time: bool = False
 
     def begin(self) -> None:
         """Begin a motion, or the next one; raises NotBegunError where it is no longer what the person wants."""
         late = None if self._in_time else self.deadline.why_passed("reaching the robot or the gripper")
-        if (reason := late or self.why_stood_still(self.given_ns)) is not None:
+        if (reason := late or self.why_stood_still()) is not None:
             raise NotBegunError(reason)
         self._in_time = True
 
 
 @dataclass(slots=True)
 class OperatorAction:
-    """Carries out one `unlock` or `release` at a time."""
+    """Carries out one `unlock` or `release` at a time; while it is `under_way`, the runner begins no other."""
 
     robot: UrRobot
     fingers: Fingers
@@ -56,11 +51,11 @@ class OperatorAction:
 
         `confirmed`: the operator says that a tool may drop.
         """
-        await self._carry_out("unlock", "unlocking", partial(self._unlock, permit, confirmed=confirmed))
+        await self._carry_out("unlock", "unlocking", self._unlock(permit, confirmed=confirmed))
 
     async def release(self, permit: MotionPermit) -> None:
         """Open the gripper, if there is one; raises DriverError and ActionError."""
-        await self._carry_out("release", "the release", partial(self._release, permit))
+        await self._carry_out("release", "the release", self._release(permit))
 
     def stop(self) -> str | None:
         """End the action under way, but not the fingers that it moves; return its command's name, or None."""
@@ -68,10 +63,8 @@ class OperatorAction:
             return None
         return self._task.get_name()
 
-    async def _carry_out(self, command: str, name: str, act: Callable[[], Coroutine[Any, Any, None]]) -> None:
-        if self.under_way:
-            raise ActionError(UNLOCKING)
-        task = self._task = asyncio.create_task(act(), name=command)
+    async def _carry_out(self, command: str, name: str, act: Coroutine[Any, Any, None]) -> None:
+        task = self._task = asyncio.create_task(act, name=command)
         # After the caller is cancelled, a failure has no receiver.
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         await asyncio.wait([task])

@@ -132,11 +132,14 @@ class StepClock(Clock):
     """The robot's time, which stands between its cycles."""
 
     def __init__(self, bench: HandlerBench) -> None:
+        self._bench, self.slept_ns = bench, 0
         super().__init__()
-        self._bench = bench
 
     def now_ns(self) -> int:
         return self._bench.now_ns
+
+    def suspended_ns(self) -> int:
+        return self.slept_ns
 
 
 class Gripper:
@@ -223,7 +226,7 @@ class Cell:
         )
         # As after a tare.
         self.control_loop.on_zero(WRENCH)
-        clock = StepClock(self.robot.bench)
+        clock = self.clock = StepClock(self.robot.bench)
         self.sensors: dict[str, Any] = {}
         self.runner = ControlLoopRunner(
             self.control_loop, self.robot, self.gripper, self.sensors, self.published, clock, NoMemory().save_present

@@ -11,7 +11,7 @@ from shearloop.daemon.loop_config import LoopConfig
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.messages import Stop, ZeroForceTorque
 from shearloop.errors import NotBegunError
-from tests.daemon.control.cell import GRIP, Cell, driven, experiment, no_tick
+from tests.daemon.control.cell import GRIP, Cell, Gripper, driven, experiment, no_tick
 
 
 @asynccontextmanager
@@ -126,6 +126,43 @@ async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_firs
     async with gripping() as cell:
         await cell.runner.halt_and_wait()
         assert cell.gripper.asked == ["grip", "halt"]
+
+
+async def test_a_daemon_that_ends_in_the_middle_of_a_release_ends_it_and_stops_the_fingers():
+    """A release that goes on would be repeated after the halt."""
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        releasing = asyncio.create_task(cell.runner.release())
+        await cell.cycles(5)
+        await cell.runner.halt_and_wait()
+        assert "the release was stopped" in await releasing
+        assert cell.gripper.asked == ["open", "halt"]
+
+
+async def test_a_loop_that_comes_back_lets_the_halt_of_a_stop_end(monkeypatch):
+    """Its first decision stops what may move since its crash."""
+
+    class Slow(Gripper):
+        async def halt(self) -> None:
+            await answers.wait()
+            await super().halt()
+
+    answers = asyncio.Event()
+    async with driven(cell=Cell(gripper=Slow())) as cell:
+        with monkeypatch.context() as crashing:
+            crashing.setattr(cell.control_loop, "tick", no_tick)
+            await cell.cycles(2)
+            await cell.loop_died()
+        cell.gripper.there.clear()
+        releasing = asyncio.create_task(cell.runner.release())
+        await cell.cycles(2)
+        assert cell.runner.stop() == "release"
+        cell.drive()
+        await cell.cycles(5)
+        answers.set()
+        await cell.cycles(2)
+        assert "the release was stopped" in await releasing
+        assert cell.gripper.asked == ["open", "halt"]
 
 
 async def test_a_stop_ends_unlocking_and_stops_the_fingers():

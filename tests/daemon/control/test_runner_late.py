@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import nullcontext
 from typing import Any
 
 import pytest
@@ -11,6 +12,7 @@ from shearloop.daemon.control.command_sender import CommandSender
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment import ExperimentPhase
 from shearloop.daemon.control.experiment_schema import GripStep
+from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_HANG_S
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.wrench import wrench_source
 from shearloop.daemon.loop_config import LoopConfig
@@ -259,6 +261,41 @@ async def test_fingers_that_moved_before_a_refusal_are_halted_by_a_stop():
         cell.runner.stop(also_idle=True)
         await cell.cycles(3)
         assert cell.gripper.asked == ["open", "halt"]
+
+
+async def test_no_fingers_begin_to_move_after_the_computer_was_suspended():
+    """CLOCK_MONOTONIC stands meanwhile, and the connection to the gripper may outlive it."""
+    async with driven() as cell:
+        permit = cell.runner.permit(NO_DEADLINE)
+        permit.begin()
+        cell.clock.slept_ns += 3_600_000_000_000
+        await cell.cycles(2)
+        with pytest.raises(NotBegunError, match=r"the daemon stood still for 3600\.0 s"):
+            permit.begin()
+        cell.runner.permit(NO_DEADLINE).begin()
+
+
+@pytest.mark.parametrize("decided_since", [False, True])
+@pytest.mark.parametrize("beyond_s", [-0.02, 0.02])
+async def test_a_standstill_is_longer_than_the_longest_time_between_two_decisions_and_a_hang(beyond_s, decided_since):
+    """What is shorter forbids nothing: a way out is not refused on a busy computer."""
+    async with driven() as cell:
+        permit = cell.runner.permit(NO_DEADLINE)
+        cell.robot.bench.now_ns += round((ARM_STALE_S + LONGEST_HANG_S + beyond_s) * 1e9)
+        if decided_since:
+            cell.runner.decide_now()
+        with pytest.raises(NotBegunError, match="the daemon stood still") if beyond_s > 0 else nullcontext():
+            permit.begin()
+
+
+async def test_fingers_may_be_opened_while_no_loop_runs():
+    """A loop that has crashed takes some seconds to come back, and decides nothing meanwhile."""
+    async with driven() as cell:
+        cell.task.cancel()
+        await asyncio.wait([cell.task])
+        cell.robot.bench.now_ns += 5_000_000_000
+        assert await cell.runner.release() is None
+        assert cell.gripper.asked == ["open"]
 
 
 async def test_an_unlock_that_has_expired_reaches_no_robot():

@@ -82,7 +82,7 @@ class RobotiqGripper:
     # The furthest position of the latest motion over this connection, and whether it has opened the fingers.
     _position: int | None = field(default=None, init=False)
     _opened: bool | None = field(default=None, init=False)
-    # The fault that an activation is to end: its reset alone hides the fault, and leaves a gripper that does not move.
+    # The latest fault that an activation has to end: a reset alone hides it, and leaves a gripper that does not move.
     _owed: messages.GripperFault | None = field(default=None, init=False)
 
     @property
@@ -144,8 +144,6 @@ class RobotiqGripper:
                 return self._state(readout, t_ns)
             if not may_drop:
                 raise messages.GripperInactiveError(blocking)
-        if fault.needs_activation:
-            self._owed = fault
         await self._write(messages.GripperAction.RESET, permit)
         not_reset = "The gripper does not take the reset; check that nothing else commands it."
         await self._wait_until(
@@ -280,7 +278,10 @@ class RobotiqGripper:
     async def _read(self, *, whole: bool = False) -> _TimedReadout:
         self._latest = _TimedReadout(*await self._exchange(partial(self.client.read, whole=whole)))
         readout = self._latest.readout
-        if readout.sta is messages.ActivationStatus.ACTIVE and not messages.fault_of(readout.flt).needs_activation:
+        fault = messages.fault_of(readout.flt)
+        if fault.needs_activation:
+            self._owed = fault
+        elif readout.sta is messages.ActivationStatus.ACTIVE:
             self._owed = None
         self._requests.take(*self._latest)
         self._follow(readout.pos)

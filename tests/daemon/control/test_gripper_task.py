@@ -447,6 +447,25 @@ async def test_a_fault_lasts_until_the_activation_that_ends_it_is_complete(way, 
 
 
 @WAYS
+async def test_a_fault_of_the_activation_replaces_the_one_that_it_was_to_end(way, tmp_path):
+    """Its sentence has the cure."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, _ = await holding(rig)
+        rig.model.fail(12)
+        asked: list[bool] = []
+
+        def permit() -> None:
+            asked.append(True)
+            if len(asked) == 2:
+                rig.model.fail(13)
+                raise NotBegunError("the activation failed")
+
+        with pytest.raises(NotBegunError, match="the activation failed"):
+            await task.unlock(permit, confirmed=True)
+        assert (await rig.driver.read()).fault.code == 13
+
+
+@WAYS
 async def test_fingers_that_are_known_to_be_empty_are_activated_unasked(way, tmp_path):
     async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
         await task_of(rig).release()

@@ -1,7 +1,7 @@
 """The gripper's task over the real driver and the emulated gripper, on both connections."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from itertools import product
@@ -23,12 +23,14 @@ from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import Permit
 from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
+    GripperAction,
     GripperCommand,
     GripperFault,
     GripperFaultError,
     GripperMove,
     GripperState,
     ObjectStatus,
+    Request,
 )
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.drivers.robotiq.widths import WidthCalibration
@@ -417,6 +419,52 @@ async def test_fingers_open_after_a_fault_although_a_request_fails_once(way, tmp
         await (task.unlock(confirmed=True) if command == "unlock" else task.open_by_operator())
         assert losses == []
         assert not task.status_of(await rig.driver.read()).may_hold
+
+
+@WAYS
+@pytest.mark.parametrize("command", ["unlock", "release"])
+@pytest.mark.parametrize("is_faulty", [True, False])
+async def test_each_request_that_may_move_the_fingers_asks_for_the_permit(way, tmp_path, command, is_faulty):
+    async with a_rig(way, tmp_path, active=is_faulty, connected=True) as rig, asyncio.timeout(DEADLINE_S):
+        task = task_of(rig)
+        if is_faulty:
+            await holding(rig)
+            rig.model.fail(12)
+        write, asked, written = rig.driver.client.write, [], []
+
+        async def note(request: Request, before: Callable[[], None]) -> None:
+            await write(request, before)
+            written.append((request, len(asked)))
+
+        rig.driver.client.write = note
+
+        def permit() -> None:
+            asked.append(True)
+
+        act = task.unlock(permit, confirmed=True) if command == "unlock" else task.open_by_operator(permit)
+        await act
+        moves = is_faulty or command == "release"
+        requests = [type(request) for request, _ in written]
+        assert requests == [GripperAction, GripperAction, GripperMove] * moves
+        assert [asks for _, asks in written] == [1, 2, 3] * moves
+
+
+@WAYS
+async def test_a_release_that_is_refused_is_not_tried_again(way, tmp_path):
+    """It would begin later by itself."""
+    async with a_rig(way, tmp_path, active=True) as rig, asyncio.timeout(DEADLINE_S):
+        task, held_mm = await holding(rig)
+        asked: list[bool] = []
+
+        def permit() -> None:
+            asked.append(True)
+            if len(asked) == 1:
+                raise NotBegunError("the daemon stood still")
+
+        with pytest.raises(NotBegunError):
+            await task.release(permit)
+        assert asked == [True]
+        assert rig.model.width_mm == held_mm
 
 
 @WAYS

@@ -12,6 +12,8 @@ int main() {
     while (zmq_recv(socket, topic, sizeof topic, 0) >= 0) {
         const int size = zmq_recv(socket, payload, sizeof payload, 0);
         const auto message = nlohmann::json::from_msgpack(payload, payload + size);
-        std::cout << message["timestamp"] << ' ' << message["torque_nm"] << ' ' << message["reason"] << std::endl;
+        std::cout << message["timestamp"] << ' ' << message["source"].get<std::string>() << ' ';
+        if (message["valid"]) std::cout << message["torque_nm"] << " N·m" << std::endl;
+        else std::cout << "no estimate: " << message["reason"].get<std::string>() << std::endl;
     }
 }

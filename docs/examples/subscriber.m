@@ -7,8 +7,8 @@ while true
     frames = cell(socket.recv_multipart());
     message = struct(py.msgpack.unpackb(frames{2}));
     if message.valid
-        fprintf("%.3f  %+.4f N·m\n", message.timestamp, message.torque_nm);
+        fprintf("%.3f  %s  %+.4f N·m\n", message.timestamp, string(message.source), message.torque_nm);
     else
-        fprintf("%.3f  no estimate: %s\n", message.timestamp, string(message.reason));
+        fprintf("%.3f  %s  no estimate: %s\n", message.timestamp, string(message.source), string(message.reason));
     end
 end

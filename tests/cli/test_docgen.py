@@ -3,8 +3,12 @@
 import asyncio
 import dataclasses
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 import zmq
@@ -75,29 +79,60 @@ def test_every_row_of_the_safety_table_is_on_the_page(written):
         assert rule.cure in written["faults.md"]
 
 
-async def test_the_python_subscriber_prints_estimates(tmp_path):
-    program = (DOCS / "examples/subscriber.py").read_text()
-    address = f"ipc://{tmp_path}/publish"
-    script = tmp_path / "subscriber.py"
-    script.write_text(program.replace("tcp://127.0.0.1:7761", address))
-    frame, estimate = sample(EitFrame), sample(EitEstimate)
+@asynccontextmanager
+async def printing(*command: object) -> AsyncIterator[asyncio.StreamReader]:
+    """Run a program, and yield what it prints."""
+    process = await asyncio.create_subprocess_exec(*map(str, command), stdout=subprocess.PIPE)
+    try:
+        async with asyncio.timeout(DEADLINE_S):
+            yield process.stdout
+    finally:
+        process.kill()
+        await process.communicate()
+
+
+async def next_line(printed: asyncio.StreamReader, part: bytes) -> bytes:
+    """Return the next line with this part."""
+    while part not in (line := await printed.readline()):
+        assert line, "the program has ended"
+    return line
+
+
+def program_of(ending: str, folder: Path) -> list[object]:
+    """Return the command that runs an example program, with the socket in this folder as the daemon's address."""
+    program = (DOCS / f"examples/subscriber.{ending}").read_text()
+    script = folder / f"subscriber.{ending}"
+    script.write_text(program.replace("tcp://127.0.0.1:7761", f"ipc://{folder}/publish"))
+    if ending == "py":
+        return [sys.executable, script]
+    compiler = shutil.which("g++")
+    if compiler is None or not all(Path("/usr/include", name).exists() for name in ("zmq.h", "nlohmann/json.hpp")):
+        pytest.skip("needs g++, libzmq3-dev and nlohmann-json3-dev to compile the C++ subscriber")
+    compiled = folder / "subscriber"
+    subprocess.run([compiler, script, "-lzmq", "-o", compiled], check=True)
+    return [compiled]
+
+
+@pytest.mark.parametrize("ending", ["py", "cpp"])
+async def test_a_subscriber_prints_whose_estimate_it_is_and_why_there_is_none(ending, tmp_path):
+    command = program_of(ending, tmp_path)
     with zmq.Context() as context:
-        publisher = Publisher(context, address, Clock())
-        process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
+        publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
         try:
-            async with asyncio.timeout(DEADLINE_S):
-                seen = asyncio.create_task(process.stdout.readline())
+            async with printing(*command) as printed:
+                seen = asyncio.create_task(next_line(printed, b" left 0.25 N\xc2\xb7m\n"))
                 while not seen.done():
                     # Until it has subscribed.
-                    publisher.publish(estimate)
+                    publisher.publish(sample(EitEstimate, source="left", torque_nm=0.25))
                     await asyncio.wait([seen], timeout=0.05)
-                assert b"text 0.5 " in seen.result()
-                publisher.publish(frame)
-                while b"text 5.0" not in (line := await process.stdout.readline()):
-                    assert line, "the program has ended"
+                publisher.publish(
+                    sample(EitEstimate, source="right", torque_nm=None, valid=False, reason="the grip is weak")
+                )
+                assert (await next_line(printed, b" right ")).endswith(b" right no estimate: the grip is weak\n")
+                if ending == "py":
+                    publisher.publish(sample(EitFrame, source="right"))
+                    await next_line(printed, b" right 5.0\n")
         finally:
-            process.kill()
-            await process.communicate()
             await asyncio.sleep(0)
             publisher.close()
 
@@ -112,7 +147,7 @@ def test_subscribers_use_existing_topics_and_keys(name):
     assert f"{PUBLISH_ADDRESS}" in program
     reads = set(re.findall(r'message\["(\w+)"\]|message\.(\w+)', program))
     named = {key.removesuffix("_shape") for pair in reads for key in pair if key}
-    assert "timestamp" in named
+    assert {"timestamp", "source", "torque_nm", "valid", "reason"} <= named
     known = {item.name for topic in ("eit.estimate", "eit.frame") for item in dataclasses.fields(TOPICS[topic])}
     assert named - {"timestamp", "seq"} <= known
 

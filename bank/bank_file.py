@@ -108,8 +108,8 @@ class Bank(BankDefinition):
     signals_sha256: str
 
     @classmethod
-    def open(cls, path: str | Path, verify: bool = False) -> "Bank":
-        """Map a bank file read-only; `verify` also compares the checksum of all signals.
+    def open(cls, path: str | Path) -> "Bank":
+        """Map a bank file read-only, and compare its checksums (0.03 s for 36 MB).
 
         Raises BankFileError for a file that is missing, not a bank, truncated, damaged, or made under another format
         or channel table.
@@ -134,7 +134,7 @@ class Bank(BankDefinition):
                 **arrays,
             )
         for name, array in arrays.items():
-            if (verify or name != "signals") and _sha256(array) != checksums[name]:
+            if _sha256(array) != checksums[name]:
                 raise _unusable(path, f"the file is damaged: the checksum of {name} is not {checksums[name][:12]}…")
         if header.get("channel_table") != bank.table.digest:
             raise _unusable(
@@ -149,7 +149,7 @@ class Bank(BankDefinition):
         for name, shape in shapes.items():
             if arrays[name].shape != shape:
                 raise _unusable(path, f"{name} has the shape {arrays[name].shape}, expected {shape}")
-            if (verify or name != "signals") and not np.isfinite(arrays[name]).all():
+            if not np.isfinite(arrays[name]).all():
                 raise _unusable(path, f"{name} has values that are not finite numbers")
         return bank
 

@@ -122,7 +122,7 @@ def _info(args: argparse.Namespace) -> int:
     from shearloop.bank.bank_file import FORMAT_VERSION, Bank
     from shearloop.bank.models import MODELS
 
-    bank = Bank.open(args.path, verify=True)
+    bank = Bank.open(args.path)
     model = MODELS[bank.model]
     grids = ("k", bank.k_grid, model.k_unit), ("sigma", bank.sigma_grid, model.sigma_unit)
     facts: dict[str, object] = {

@@ -74,7 +74,9 @@ class Run:
     torque_note: str = ""
     # The part of the hold time with a fault that a busy computer can cause.
     late_s: float = 0.0
+    # The holds by kinds of faults, and the kinds of the latest hold, each of which counts once.
     hold_reasons: Counter[str] = field(default_factory=Counter)
+    kinds_of_hold: set[str] = field(default_factory=set)
     # By source, why a torque was not valid.
     invalid: defaultdict[str, CountedReasons] = field(default_factory=lambda: defaultdict(CountedReasons))
     # By source, time in ns, torque and the ends of its interval, NaN without one, in N·m.

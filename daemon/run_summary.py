@@ -138,8 +138,14 @@ def _update(run: Run, content: Mapping[str, Any]) -> None:
         run.late_s += content["held_s"] - run.last["held_s"]
     if run.last["phase"] == "paused" and run.steps:
         run.steps[-1].paused_s += elapsed_s(run.last, content)
-    if content["response"] == "hold" and run.last["response"] != "hold":
-        run.hold_reasons[FaultCode.of_text(_codes(content)[0]).value.kind] += 1
+    if content["response"] == "hold":
+        if run.last["response"] != "hold":
+            run.kinds_of_hold.clear()
+        # The cause can change while the wrist is held.
+        kind = FaultCode.of_text(_codes(content)[0]).value.kind
+        if kind not in run.kinds_of_hold:
+            run.kinds_of_hold.add(kind)
+            run.hold_reasons[kind] += 1
     run.last = content
     if content.get("torque_nm") is not None:
         run.torque_note = content.get("torque_note") or run.torque_note

@@ -59,7 +59,7 @@ def rewrite_array(path, name, change):
 
 def test_what_is_written_is_read_back(path):
     signals = write(path)
-    bank = Bank.open(path, verify=True)
+    bank = Bank.open(path)
     np.testing.assert_array_equal(bank.signals, signals)
     np.testing.assert_array_equal(bank.homogeneous, np.arange(896.0))
     np.testing.assert_array_equal(bank.valid, np.eye(4, 3, dtype=bool))
@@ -109,7 +109,6 @@ def test_a_cut_anywhere_is_refused(path):
 
 def test_every_flipped_byte_is_found(path):
     whole = path.read_bytes()
-    signals_at = Bank.open(path).signals.offset
     arrays = json.loads(whole[48:4096])["arrays"]
     sizes = {name: math.prod(a["shape"]) * int(a["type"][-1]) for name, a in arrays.items()}
     used = [range(4096)] + [range(a["offset"], a["offset"] + sizes[name]) for name, a in arrays.items()]
@@ -119,9 +118,7 @@ def test_every_flipped_byte_is_found(path):
         damaged[position] ^= 0x10
         path.write_bytes(damaged)
         with pytest.raises(BankFileError, match=r"small\.bank: "):
-            Bank.open(path, verify=True)
-        if position >= signals_at:
-            assert Bank.open(path).identity == DEFINITION.identity
+            Bank.open(path)
 
 
 @pytest.mark.parametrize("definition", ["banks/mine.yaml", "mine.yaml", "../config/banks/mine.yaml"])
@@ -195,7 +192,7 @@ def test_a_header_that_is_no_json_is_refused(path, text):
 def test_an_array_of_another_shape_or_without_numbers_is_refused(path, name, change, problem):
     rewrite_array(path, name, change)
     with pytest.raises(BankFileError, match=re.escape(f"{name} has {problem}")):
-        Bank.open(path, verify=True)
+        Bank.open(path)
 
 
 def test_a_pipe_is_not_read(tmp_path):

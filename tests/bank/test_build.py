@@ -28,7 +28,7 @@ def finished(fingertip, tmp_path_factory) -> Path:
 
 
 def test_every_cell_is_the_difference_of_two_solutions_or_marked_not_valid(finished, fingertip, forward):
-    bank = Bank.open(finished, verify=True)
+    bank = Bank.open(finished)
     np.testing.assert_allclose(bank.homogeneous, forward.homogeneous(), rtol=1e-12)
     kinds = set()
     for i, k in enumerate(K):

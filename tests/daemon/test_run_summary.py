@@ -183,6 +183,15 @@ def test_holds_are_counted_by_their_kind():
     assert f"by faults, the wrist was held for 2.5 s in all: twice {stale.value.kind}\n" in text
 
 
+def test_each_cause_of_one_hold_is_counted_once():
+    lost, other = FaultCode.SENSOR_LOST, FaultCode.TORQUES_DISAGREE
+    causes = (lost, other, lost, other)
+    held = [loop_state(20 + n, phase="held", response="hold", faults=code.text) for n, code in enumerate(causes)]
+    text = summary_of_hold(None, [], *held, loop_state(24))
+    reasons = f"once {lost.value.kind}; once {other.value.kind}"
+    assert f"by faults, the wrist was held for 4.0 s in all: {reasons}\n" in text
+
+
 def test_an_experiment_that_was_stopped_says_why():
     stopped = loop_state(5, phase="stopped", activity="the operator said stop")
     assert summary_of(loop_state(0), stopped).splitlines()[1:3] == [

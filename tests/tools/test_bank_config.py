@@ -144,7 +144,7 @@ def test_build_writes_the_bank_and_reports_its_identity(folder, tmp_path, capsys
     capsys.readouterr()
     build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1"]
     result = result_of(*build)
-    bank = Bank.open(tmp_path / "b.bank", verify=True)
+    bank = Bank.open(tmp_path / "b.bank")
     assert (result["identity"], result["shape"], result["model"]) == (bank.identity, [*bank.signals.shape], bank.model)
     assert result["valid_cells"] == bank.valid.sum()
 

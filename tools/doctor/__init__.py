@@ -285,7 +285,7 @@ def check_bank(name: str, fingertip: FingertipConfig, geometry: GivenGeometry | 
     if fingertip.bank is None:
         return note(subject, "not configured", "there are no heatmaps, no k and no sigma", "add `bank:` to get them")
     try:
-        bank = Bank.open(fingertip.bank, verify=True)
+        bank = Bank.open(fingertip.bank)
     except BankError as error:
         return from_error(subject, error, "no frame can be matched, and the daemon does not start")
     found = (

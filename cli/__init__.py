@@ -146,6 +146,10 @@ def _run(argv: Sequence[str] | None) -> int:
     except USER_ERRORS as error:
         print(f"{program}: {error}", file=sys.stderr)
         return EXIT_USAGE
+    except MemoryError as error:
+        cure = "close other programs, or ask for less at a time"
+        print(f"{program}: not enough memory: {str(error) or 'none is left'}; {cure}", file=sys.stderr)
+        return EXIT_USAGE
     except KeyboardInterrupt as interrupt:
         if not interrupt_is_end:
             # A closed terminal accepts no output.

@@ -97,7 +97,7 @@ def mistake_lines(
         sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
         if kind == "value_error":
             line = _line_of_named(sentence, location, content, root) or line
-        is_number = wrong_key and str(location[-1]).isdecimal()
+        is_number = wrong_key and _written(location, content, root, key=True).isdecimal()
         if is_number and root is not None and not _written(location, content, root, key=False):
             # In braces, YAML reads the part behind a comma as a key without a value.
             sentence += _POINT
@@ -114,11 +114,11 @@ def place_of(
     key, line, last = "", 1, len(location) - 1
     for number, part in enumerate(location):
         child: yaml.Node | None = None
-        if isinstance(content, Mapping) and part in content:
+        if isinstance(content, Mapping) and (written := _key_of(content, part)) is not None:
             if isinstance(node, yaml.MappingNode):
-                name, child = _pair(content, part, node)
+                name, child = _pair(content, written, node)
                 line = name.start_mark.line + 1
-            content = content[part]
+            content = content[written]
         elif isinstance(content, list | tuple) and isinstance(part, int) and part < len(content):
             content = content[part]
             if isinstance(node, yaml.SequenceNode):
@@ -144,7 +144,12 @@ def _line_of_named(sentence: str, location: Sequence[int | str], content: object
     return None
 
 
-def _pair(content: Mapping[Any, object], key: int | str, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:
+def _key_of(content: Mapping[Any, object], part: int | str) -> Any:
+    """Return the key of a section that a part of a location means, None for another part: 0.5 is a text there."""
+    return next((key for key in content if key == part or (isinstance(key, float) and str(key) == part)), None)
+
+
+def _pair(content: Mapping[Any, object], key: Any, node: yaml.MappingNode) -> tuple[yaml.Node, yaml.Node]:
     """Return the nodes of a key and of its value; keys are unique, so that they stand in the content's order."""
     name, value = node.value[list(content).index(key)]
     return name, value
@@ -154,9 +159,11 @@ def _written(location: Sequence[int | str], content: object, node: yaml.Node | N
     """Return the value at a location as it is written in the file, or its key; else an empty text."""
     name = node
     for part in location:
-        if isinstance(content, Mapping) and part in content and isinstance(node, yaml.MappingNode):
-            name, node = _pair(content, part, node)
-            content = content[part]
+        if isinstance(content, Mapping) and isinstance(node, yaml.MappingNode):
+            written = _key_of(content, part)
+            if written is not None:
+                name, node = _pair(content, written, node)
+                content = content[written]
         elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
             if part >= len(content):
                 # The entry is missing.

@@ -46,6 +46,13 @@ from tests.paper_curve import paper_curve
 from tests.sample_messages import sample
 
 
+@pytest.mark.parametrize("found", ["Unable to allocate 34 MiB", ""])
+def test_a_lack_of_memory_is_one_sentence(found, monkeypatch, mistake, tiny_bank):
+    monkeypatch.setattr("shearloop.bank.bank_file.Bank.open", Mock(side_effect=MemoryError(*filter(None, [found]))))
+    said, cure = found or "none is left", "close other programs, or ask for less at a time"
+    assert mistake("bank", "info", tiny_bank) == f"shearloop bank: not enough memory: {said}; {cure}\n"
+
+
 def test_a_file_that_is_not_there_hides_no_other_mistake(config, tmp_path, mistake):
     steps = "[{do: wiat}, {do: turn_to, angle_rad: 90}, {do: hold_torque, torque_nm: 9}]"
     (tmp_path / "experiment.yaml").write_text(f"name: one\nsteps: {steps}\n")

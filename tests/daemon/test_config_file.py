@@ -232,6 +232,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         ("torque_limit_nm: 1\nsteps: 3\n", "steps: 3 is not a list"),
         ("1: 2\n", "the key 1 is a number; a name is expected"),
         ("spare: {hold_s: 0,1}\n", "spare: the key 1 is a number; a name is expected; the decimal sign is a point"),
+        ("spare: {hold_s: 0,08}\n", "spare: the key 08 is a number; a name is expected; the decimal sign is a point"),
         ("torque_limit_nm: 0,1\n", "'0,1' is not a number; the decimal sign is a point: 0.1, not 0,1; allowed"),
         ("".join(f"key{number}: 1\n" for number in range(8000)), ": 7901 more mistakes"),
         ("torque_limit_nm: 1\nlow: 3\n", ": low must be below high, but low is 3 and high is 1"),

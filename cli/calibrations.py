@@ -65,15 +65,6 @@ def check_recipe(args: argparse.Namespace, recordings: Sequence[Path]) -> None:
             raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
-def check_calibration_file(out: Path) -> None:
-    """Raise UserError, before anything is measured, unless `out` can become a calibration file."""
-    if not out.parent.is_dir():
-        raise UserError(f"--out {out} cannot be written: the folder {out.parent} does not exist")
-    from shearloop.tools.outputs import YAML_KEYS, check_overwrite
-
-    check_overwrite(out, "a calibration file", YAML_KEYS)
-
-
 def load_calibration(path: Path) -> "Calibration":
     """Return the calibration in a file; raises UserError for a recording, and CalibrationError as `load` does."""
     from shearloop.estimation import Calibration

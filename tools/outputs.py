@@ -69,13 +69,27 @@ def is_same_file(one: Path, other: Path) -> bool:
         return os.path.realpath(one) == os.path.realpath(other)
 
 
+def check_place(out: Path) -> None:
+    """Raise UserError if no file can be made at `out`: it is a folder, or its own folder is missing or not writable.
+
+    A command asks this before it works for long.
+    """
+    if os.path.isdir(out):
+        raise UserError(f"{out} is a folder; give the name of a file in it")
+    if not os.path.isdir(out.parent):
+        raise UserError(f"{out}: there is no folder {out.parent}; make it, or choose another path")
+    if not os.path.lexists(out) and not os.access(out.parent, os.W_OK | os.X_OK):
+        raise UserError(f"{out}: you may not write in the folder {out.parent}; choose another path")
+
+
 def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | None = None) -> None:
     """Raise UserError if `out` is a file of another kind: one that does not begin with `begins`, or is no text.
 
     A missing word in `calibrate --out recordings/*.mcap` would otherwise overwrite a recording. Errors of reading are
-    left to the code that writes the file. A link to nothing is refused too.
+    left to the code that writes the file. A link to nothing is refused too, and a place where no file can be made.
     """
     check_link("--out", out)
+    check_place(out)
     if not out.is_file():
         return
     try:
@@ -88,10 +102,11 @@ def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | No
 
 
 def check_new(out: Path) -> None:
-    """Raise UserError if `out` exists, or is a link to nothing: for a file that cannot be made again."""
+    """Raise UserError if `out` exists, or no file can be made there: for a file that cannot be made again."""
     check_link("--out", out)
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
+    check_place(out)
 
 
 def _is_of_kind(head: bytes, begins: bytes | re.Pattern[bytes] | None) -> bool:

@@ -7,13 +7,13 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.calibrations import check_calibration_file
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option
 from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
 from shearloop.drivers.defaults import URCAP_PORT
 from shearloop.drivers.robotiq.models import MODELS
 from shearloop.errors import UserError
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
     if len(set(args.diameter_mm)) < 2:
         raise UserError("give at least two different --diameter-mm")
-    check_calibration_file(args.out)
+    check_overwrite(args.out, "a calibration file", YAML_KEYS)
     if args.host is not None and (reason := why_no_address(args.host)):
         raise UserError(f"--host: {args.host!r} {reason}")
     client: RobotiqClient

@@ -7,10 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.cli.calibrations import check_calibration_file
 from shearloop.cli.options import add_json, add_option, number
 from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite
 
 if TYPE_CHECKING:
     from shearloop.drivers.connection import SerialPort
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.drivers.load_cell import BAUD_RATE
     from shearloop.drivers.load_cell_calibration import check_masses, fit_levels
 
-    check_calibration_file(args.out)
+    check_overwrite(args.out, "a calibration file", YAML_KEYS)
     replaced = args.out.exists()
     check_masses(args.mass_g)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:

@@ -30,10 +30,11 @@ def matlab() -> bytes:
 
 
 # Each mistake must be told before anything else is looked at, or solved for minutes; so nothing that is named is there.
-@pytest.mark.parametrize(
+WRITERS = pytest.mark.parametrize(
     ("command", "kind"),
     [
         ("calibrate no.mcap --out", "an estimator's calibration"),
+        ("adapt no.cal no.mcap --out", "an estimator's calibration"),
         ("calibrate load --mass-g 100 --lever-arm-mm 35 --port no --out", "a calibration file"),
         ("calibrate gripper --model 2F-140 --diameter-mm 10 --diameter-mm 20 --port no --out", "a calibration file"),
         ("skin calibrate no.csv --out", "a calibration file"),
@@ -43,12 +44,39 @@ def matlab() -> bytes:
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
+BANK = Path(__file__).parents[2] / "config" / "banks" / "demo.yaml"
+
+
+@WRITERS
 def test_no_command_overwrites_a_file_of_another_kind(command, kind, tmp_path, mistake):
     there = tmp_path / "precious"
     there.write_bytes(MCAP)
-    bank = Path(__file__).parents[2] / "config" / "banks" / "demo.yaml"
-    assert f"{there} exists and is not {kind}: it was not changed" in mistake(*command.format(bank=bank).split(), there)
+    assert f"{there} exists and is not {kind}: it was not changed" in mistake(*command.format(bank=BANK).split(), there)
     assert there.read_bytes() == MCAP
+
+
+@WRITERS
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [
+        ("none/a.png", "none/a.png: there is no folder"),
+        ("file/a.png", "file/a.png: there is no folder"),
+        ("folder.png", "folder.png is a folder; give the name of a file in it"),
+        ("new.png", "new.png: you may not write in the folder"),
+    ],
+)
+def test_no_command_begins_with_a_place_where_it_can_write_no_file(
+    command, kind, out, said, tmp_path, monkeypatch, mistake
+):
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.png").mkdir()
+    if out == "new.png":
+        monkeypatch.setattr("os.access", lambda *_: False)
+    if kind == "a MATLAB file" and out == "folder.png":
+        # It writes a file in the folder, so that it reads the recording.
+        said = "no.mcap"
+    assert said in mistake(*command.format(bank=BANK).split(), tmp_path / out)
+    assert {one.name for one in tmp_path.iterdir()} == {"file", "folder.png"}
 
 
 @pytest.mark.parametrize(
@@ -100,7 +128,6 @@ def test_same_kind_empty_and_special_files_may_be_overwritten(tmp_path):
     check_overwrite(file, "a configuration")
     os.mkfifo(tmp_path / "pipe")
     check_overwrite(tmp_path / "pipe", "a bank", b"BANK")
-    check_overwrite(tmp_path, "a bank", b"BANK")
 
 
 TABLE = "r1_ohm,r2_ohm,shear_n,normal_n\n1.0,2.0,0.1,1.0\n"

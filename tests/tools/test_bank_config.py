@@ -193,7 +193,7 @@ def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder
     ran(*solve)
     assert np.load(out).shape == (896,)
     assert link.is_symlink()
-    assert "Is a directory" in mistake(*solve[:-1], f"{tmp_path}")
+    assert "is a folder" in mistake(*solve[:-1], f"{tmp_path}")
 
 
 def test_solve_on_the_papers_mesh_gives_the_voltages_of_eidors(shared, tmp_path):
@@ -221,7 +221,7 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
     ("arguments", "part"),
     [
         ([*BUILD, "--jobs", "0"], "--jobs 0 is not a whole number above 0"),
-        ([*BUILD, "--out", "{folder}"], "is a directory; give the name of a file"),
+        ([*BUILD, "--out", "{folder}"], "is a folder; give the name of a file"),
         ([*BUILD, "--out", "/dev/null"], "/dev/null is no file, and cannot hold a bank; give the name of a file"),
         ([*BUILD, "--out", "{folder}/tip.yaml/a.bank"], "there is no folder"),
         ([*BUILD, "--config", "{folder}/none.yaml"], "none.yaml: the bank's description cannot be read"),
@@ -233,7 +233,7 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
         ([*SOLVE, "--mesh", "{folder}/a.bank"], "is not a mesh"),
         ([*SOLVE, "--model", "x"], "no basis model"),
         ([*SOLVE, "--k", "nan"], "finite"),
-        ([*SOLVE, "--out", "{folder}"], "the voltages cannot be written: Is a directory"),
+        ([*SOLVE, "--out", "{folder}"], "is a folder; give the name of a file"),
     ],
 )
 def test_mistakes_are_one_sentence(folder, tmp_path, arguments, part, mistake):

@@ -315,7 +315,7 @@ def test_a_gripper_of_another_model_is_measured_where_its_counts_begin_and_bow(t
     [
         ("load --port /dev/none --mass-g 100 --out load.yaml", "no serial port /dev/none"),
         ("load --port /dev/none --mass-g -1 --out load.yaml", "mass in grams"),
-        ("load --port /dev/none --mass-g 1 --out no/load.yaml", "does not exist"),
+        ("load --port /dev/none --mass-g 1 --out no/load.yaml", "there is no folder no"),
         ("load --port /dev/none --mass-g 1 --lever-arm-mm 0 --out l.yaml", "--lever-arm-mm 0"),
         (
             "load --port /dev/none --mass-g 1 --lever-arm-mm 0.035 --out l.yaml",

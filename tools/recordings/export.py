@@ -121,7 +121,7 @@ def _export_tables(path: Path, form: str, out: Path, topics: list[str], progress
     for target in (paths | units).values():
         check_link("--out", target)
         check_apart("--out", target, [(f"the recording {path}", path)])
-    for target in units.values():
+    for target in units.values() if out.is_dir() else ():
         check_overwrite(target, "the units of exported tables", _UNITS_HEAD.encode())
     columns = columns_of_topics(path, topics)
     tables: dict[str, _CsvTable | _ParquetTable] = {}

@@ -45,12 +45,20 @@ def commands() -> str:
 
 
 def subscribers() -> str:
-    """Return the example programs of `docs/examples/`."""
+    """Return the example programs of `docs/examples/` for a daemon on the same machine."""
     parts = []
     for language, (ending, fence) in _LANGUAGES.items():
-        text = (EXAMPLES / f"subscriber.{ending}").read_text(encoding="utf-8").strip()
-        parts.append(f"### {language}\n\n```{fence}\n{text}\n```")
+        parts.append(f"### {language}\n\n{_program(f'subscriber.{ending}', fence)}")
     return "\n\n".join(parts)
+
+
+def subscriber_with_keys() -> str:
+    """Return the example program for a daemon on another computer."""
+    return _program("subscriber_with_keys.py", "python")
+
+
+def _program(name: str, fence: str) -> str:
+    return f"```{fence}\n{(EXAMPLES / name).read_text(encoding='utf-8').strip()}\n```"
 
 
 def _keys(kind: type[Message]) -> Iterator[tuple[str, ...]]:
@@ -141,6 +149,7 @@ def pages() -> dict[Path, str]:
         "topics": topics,
         "commands": commands,
         "subscribers": subscribers,
+        "subscriber with keys": subscriber_with_keys,
         "safety table": safety_table,
         "error kinds": error_kinds,
         "configuration": configuration,

@@ -19,12 +19,13 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.faults import TABLE
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.messaging.keys import load_key_pair
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.torques import LOAD_CELL, WRENCH
-from tests.fixtures.daemons import DEADLINE_S
+from tests.fixtures.daemons import DEADLINE_S, running_daemon
 from tests.sample_messages import sample
 
 PAGES = pages()
@@ -135,6 +136,46 @@ async def test_a_subscriber_prints_whose_estimate_it_is_and_why_there_is_none(en
         finally:
             await asyncio.sleep(0)
             publisher.close()
+
+
+async def test_the_subscriber_with_keys_hears_a_daemon_on_the_network(config, keys, tmp_path, monkeypatch):
+    folder = tmp_path / "home/.config/shearloop"
+    folder.mkdir(parents=True)
+    for file in (keys / "ada/client.key_secret", keys / "keys/server.key"):
+        shutil.copy(file, folder)
+    curve = {"server_key": str(keys / "keys/server.key_secret"), "clients": str(keys / "keys/clients")}
+    script = tmp_path / "subscriber.py"
+    async with running_daemon(config(publish="tcp://0.0.0.0:*", curve=curve)) as daemon:
+        address = daemon.publisher.address.replace("//0.0.0.0:", "//127.0.0.1:")
+        program = (DOCS / "examples/subscriber_with_keys.py").read_text()
+        script.write_text(program.replace("tcp://lab-pc:7761", address))
+        monkeypatch.setenv("HOME", str(tmp_path / "home"))
+        async with printing(sys.executable, script) as printed:
+            seen = asyncio.create_task(next_line(printed, b" left 0.25\n"))
+            while not seen.done():
+                # Until it has subscribed.
+                daemon.publisher.publish(sample(EitEstimate, source="left", torque_nm=0.25))
+                await asyncio.wait([seen], timeout=0.05)
+            await seen
+
+
+def test_the_key_file_on_the_page_has_the_format_that_keys_writes(keys, written, tmp_path):
+    (shown,) = re.findall(r"```text\n(# shearloop: a ZeroMQ CURVE key.*?)```", written["messages.md"], re.DOTALL)
+    page = tmp_path / "page.key_secret"
+    page.write_text(shown)
+    page.chmod(0o600)
+    pages, made = load_key_pair(page), load_key_pair(keys / "ada/client.key_secret")
+    text = (keys / "ada/client.key_secret").read_text()
+    assert (
+        text.replace(made.public.decode(), pages.public.decode()).replace(made.secret.decode(), pages.secret.decode())
+        == shown
+    )
+    # Each line is explained, and a public file has the same lines but for the secret.
+    rows = dict(re.findall(r"^\| `([^`]+)` \| (.*) \|$", written["messages.md"], re.MULTILINE))
+    words = [line.split()[0] for line in text.splitlines()]
+    assert set(words) - {"#"} <= set(rows)
+    assert [line.split()[0] for line in (keys / "ada/client.key").read_text().splitlines()] == words[:-1]
+    assert f"{len(made.public)} characters" in rows["public-key"]
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])

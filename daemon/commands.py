@@ -39,12 +39,15 @@ ARGUMENTS: Mapping[str, Mapping[str, type]] = {
     "unlock": {"confirmed": bool, "digest": str, "stop": int},
     "release": {"confirmed": bool, "ask": bool, "digest": str},
 }
-# Arguments that each of them may have: the process that it is meant for, the time until which it may begin, and the
-# sender's own name of the request.
-_OF_ALL: Mapping[str, type] = {"instance": str, "until_ns": int, "request_id": str}
+# Arguments that each of them may have: the process that it is meant for, when the operator asked for it at the
+# earliest, until when it may begin, and the sender's own name of the request.
+_OF_ALL: Mapping[str, type] = {"instance": str, "asked_ns": int, "until_ns": int, "request_id": str}
 _KINDS: Mapping[type, str] = {bool: "true or false", int: "a whole number", str: "text"}
 STOP_DELAY_S = 0.05
-_ANOTHER_DAEMON = "it is meant for an earlier daemon, and this one has begun since; look at the rig, and send it again"
+# A request that does not say when it was asked for may be as old.
+_OLDEST_S = 5.0
+_LOOK_AGAIN = "look at the rig, and send it again"
+_ANOTHER_DAEMON = f"it is meant for an earlier daemon, and this one has begun since; {_LOOK_AGAIN}"
 
 
 class TareRefusal(Protocol):
@@ -62,7 +65,7 @@ class Answered(NamedTuple):
     refusal: str | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Commands:
     """Executes the commands of the command socket.
 
@@ -80,6 +83,8 @@ class Commands:
     report: Callable[["Answered"], None] = lambda _: None
     running_rig: RunningRig = field(default_factory=RunningRig)
     now_ns: Callable[[], int] = boot_ns
+    # When the latest stop came, by `now_ns`.
+    _stopped_ns: int | None = field(default=None, init=False)
     # Sender, `request_id` and refusal of the latest stops that have one.
     _latest_stops: deque[tuple[Any, Any, str | None]] = field(default_factory=lambda: deque(maxlen=16), init=False)
 
@@ -108,7 +113,7 @@ class Commands:
             if name != STOP and not self._is_for_this_one(request):
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in MAY_BE_UNBOUND and not request.get("ask"):
-                _refuse_if(_why_unbound(name, request))
+                _refuse_if(_why_unbound(name, request) or self._why_stopped_since(request))
             if name not in NEVER_LATE:
                 _refuse_if(self._deadline(request).why_passed())
             reply = await handler(request)
@@ -123,6 +128,16 @@ class Commands:
             if not request.get("ask") and not self._is_told_again(name, request, refusal):
                 self.report(Answered(name, request, refusal))
         return reply
+
+    def _why_stopped_since(self, request: Request) -> str | None:
+        """Return why a stop ends a request that lets something move, or None: a stop can overtake an older request."""
+        if self._stopped_ns is None:
+            return None
+        if "asked_ns" not in request:
+            ago_s = (self.now_ns() - self._stopped_ns) / 1e9
+            unsure = "and without `asked_ns` nothing shows that this request is of later"
+            return f"a stop came {ago_s:.1f} s ago, {unsure}; {_LOOK_AGAIN}" if ago_s <= _OLDEST_S else None
+        return f"a stop came after it was asked for; {_LOOK_AGAIN}" if request["asked_ns"] <= self._stopped_ns else None
 
     def _is_for_this_one(self, request: Request) -> bool:
         """Return whether a request is meant for this daemon, and not for one before it."""
@@ -273,6 +288,7 @@ class Commands:
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
+        self._stopped_ns = self.now_ns()
         # The instance shows a page that it displayed another daemon.
         return {**self._stopped(request), "process": os.getpid(), "instance": self.running_rig.instance}
 

@@ -1,4 +1,4 @@
-"""What a client adds to a request: the daemon that it is meant for, and the time until which it may begin.
+"""What a client adds to a request: the daemon that it is meant for, when it was asked for, and when it is too late.
 
 It imports little, so that `shearloop command stop` is quick on a busy computer.
 """
@@ -18,11 +18,11 @@ class LateRequestError(UserError):
 
 
 def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[str, str | int]:
-    """Return what binds a request to the daemon that gave this reply to `status`, and to the time that is left.
+    """Return what binds a request to the daemon that gave this reply to `status`, and to the operator's act.
 
-    A daemon that begins later refuses it. This one refuses it later than `within_s` after the operator's act, which was
-    at most `age_s` ago when the reply came. Raises LateRequestError if no time is left. Nothing binds it to a daemon
-    that does not say which one it is, or what its clock shows.
+    The act was at most `age_s` ago when the reply came. A daemon that begins later refuses the request. This one
+    refuses it later than `within_s` after the act, or after a `stop` that came since then. Raises LateRequestError if
+    no time is left. Nothing binds it to a daemon that does not say which one it is, or what its clock shows.
     """
     if age_s > within_s:
         raise LateRequestError(
@@ -34,5 +34,6 @@ def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[
     if isinstance(instance := daemon.get("instance"), str):
         bound["instance"] = instance
     if isinstance(now_ns := daemon.get("now_ns"), int):
-        bound["until_ns"] = now_ns + round((within_s - age_s) * 1e9)
+        asked_ns = now_ns - round(age_s * 1e9)
+        bound |= {"asked_ns": asked_ns, "until_ns": asked_ns + round(within_s * 1e9)}
     return bound

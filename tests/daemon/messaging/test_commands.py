@@ -151,6 +151,36 @@ async def test_what_is_asked_for_too_long_ago_is_refused_unless_it_lets_nothing_
     assert ("it came 0.1 s too late" in str(refused.value)) is (name != "pause")
 
 
+@pytest.mark.parametrize("name", ["start", "resume", "unlock", "release"])
+async def test_a_stop_ends_every_request_that_was_asked_for_before_it(name):
+    """The daemon stood still for a moment, and read the stop before the older request."""
+    now_ns, rig = 7_000_000_000, SimpleNamespace(tasks=dict, rig="bench")
+    commands = Commands(None, None, None, rig, asyncio.Event(), None, now_ns=lambda: now_ns)
+    handlers = commands.handlers()
+
+    async def refusal(request: dict[str, Any]) -> str:
+        with pytest.raises(CommandRefusedError) as refused:
+            await handlers[name](request)
+        return str(refused.value)
+
+    of_before = meant_for(await handlers[STATUS]({}), 0.1, 2.0)
+    stopped_before = "a stop came after it was asked for; look at the rig, and send it again"
+    assert await refusal(of_before) != stopped_before
+    now_ns += 200_000_000
+    await handlers[STOP]({"spare_daemon": True})
+    assert await refusal(of_before) == stopped_before
+    # The reply to `status` came after the stop, and the operator's word before it.
+    now_ns += 100_000_000
+    assert await refusal(meant_for(await handlers[STATUS]({}), 0.2, 2.0)) == stopped_before
+    of_now = meant_for(await handlers[STATUS]({}), 0.05, 2.0)
+    assert await refusal(of_now) != stopped_before
+    undated = {key: of_now[key] for key in ("instance", "until_ns")}
+    assert "a stop came 0.1 s ago, and without `asked_ns` nothing shows" in await refusal(undated)
+    now_ns += 5_000_000_000
+    undated["until_ns"] = now_ns + 1
+    assert "a stop came" not in await refusal(undated)
+
+
 async def test_a_stop_that_is_sent_again_is_reported_once():
     """The one that ends an idle daemon is sent again with its time, and was recorded twice."""
     told: list[Answered] = []
@@ -188,6 +218,7 @@ async def test_nothing_is_sent_that_was_asked_for_too_long_ago():
         meant_for({"daemon": {"instance": "a1", "now_ns": 1}}, 2.1, 2.0)
     assert meant_for({"daemon": {"instance": "a1", "now_ns": 1}}, 0.5, 2.0) == {
         "instance": "a1",
+        "asked_ns": -499_999_999,
         "until_ns": 1_500_000_001,
     }
     assert meant_for({}, 0.5, 2.0) == {}

@@ -240,7 +240,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
             return [
                 f"stop: {stop_client.nothing_moved(reply)}, and {reply['held']}. The daemon continues, so that "
                 "`shearloop command release` can open them, and the next start waits for `shearloop command unlock`. "
-                "Ctrl-C in its terminal ends the daemon, or `systemctl stop shearloop`."
+                "Ctrl-C in its terminal ends the daemon, or `systemctl stop shearloop` on its computer."
             ]
         if reply.get("ended_by_itself"):
             return [f"stop: {stop_client.nothing_moved(reply)}; after 5 s, a further stop ends the daemon"]

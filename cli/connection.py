@@ -59,15 +59,12 @@ def client_keys(args: argparse.Namespace, address: str | None = None) -> "Client
         why = f"the daemon at {address} is open to the network and answers only with keys"
     if not why and args.key is None and args.server_key is None:
         return None
-    from shearloop.daemon.messaging.keys import ClientKeys
+    from shearloop.daemon.messaging.keys import COPIED_SERVER_CURE, OWN_CLIENT_CURE, ClientKeys
 
     folder = user_key_folder()
     key = args.key or folder / "client.key_secret"
     server_key = args.server_key or folder / "server.key"
-    for path, option, cure in (
-        (key, "--key", "make one with `shearloop keys client`"),
-        (server_key, "--server-key", "copy the daemon's server.key there"),
-    ):
+    for path, option, cure in ((key, "--key", OWN_CLIENT_CURE), (server_key, "--server-key", COPIED_SERVER_CURE)):
         if not path.exists():
             needed = f"{why}, and " if why else ""
             raise MissingKeyError(f"{needed}there is no key {path}: {cure}, or give {option}")

@@ -2,7 +2,6 @@
 
 import argparse
 import re
-import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -10,11 +9,10 @@ from pathlib import Path
 from shearloop.cli.connection import user_key_folder
 from shearloop.cli.options import add_action, add_json, add_option, run_action
 from shearloop.cli.terminal import print_result
+from shearloop.daemon.messaging.addresses import SERVER_KEYS, keys_command
 from shearloop.errors import UserError
 
 run = run_action
-
-SERVER_FOLDER = Path("/etc/shearloop/keys")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
 
     def action(
-        name: str, summary: str, run: Callable[[argparse.Namespace], int], folder: Path = SERVER_FOLDER
+        name: str, summary: str, run: Callable[[argparse.Namespace], int], folder: Path = SERVER_KEYS
     ) -> argparse.ArgumentParser:
         added = add_action(actions, name, summary, run)
         add_option(added, "--dir", Path, "DIR", "folder of the keys (default: %(default)s)", default=folder)
@@ -52,7 +50,7 @@ def _server(args: argparse.Namespace) -> int:
     sentences = [
         f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
-        f"next: `{_allow_command(folder)}` for each client's .key, then add to the configuration:",
+        f"next: {keys_command('allow FILE', folder)} for each client's .key, then add to the configuration:",
         f"curve: {_in_braces({'server_key': str(secret), 'clients': str(clients)})}",
     ]
     content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
@@ -75,20 +73,26 @@ def _client(args: argparse.Namespace) -> int:
     sentences = [
         f"{secret}: your secret key; it never leaves this machine",
         f"{public}: copy this file to the daemon's machine and run `sudo shearloop keys allow FILE --name YOU` there; "
-        f"if its keys are not in {SERVER_FOLDER}, add `--dir` with their folder",
+        f"if its keys are not in {SERVER_KEYS}, add `--dir` with their folder",
         f"copy the daemon's server.key back to {folder / 'server.key'}",
     ]
     return print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
 
 def _allow(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_public_key
+    from shearloop.daemon.messaging.keys import (
+        CLIENTS_PUBLIC_CURE,
+        allowed_clients,
+        load_public_key,
+        server_cure,
+        write_public_key,
+    )
 
-    public = load_public_key(args.key)
+    public = load_public_key(args.key, CLIENTS_PUBLIC_CURE)
     name, clients = args.name or args.key.stem, args.dir / "clients"
     _check_name(name)
     allowed, server = allowed_clients(clients).names, args.dir / "server.key"
-    if server.exists() and load_public_key(server) == public:
+    if server.exists() and load_public_key(server, server_cure(args.dir.absolute())) == public:
         raise UserError(f"{args.key} is the daemon's own key: allow the client.key that `shearloop keys client` makes")
     if public in allowed:
         raise UserError(f"{args.key} is allowed already, as {allowed[public]}")
@@ -113,22 +117,15 @@ def _revoke(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key
+    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, server_cure
 
-    server = load_public_key(args.dir / "server.key").decode()
+    server = load_public_key(args.dir / "server.key", server_cure(args.dir.absolute())).decode()
     allowed = allowed_clients(args.dir / "clients")
     clients = {name: key.decode() for key, name in allowed.names.items()}
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items()), *allowed.unusable]
     if not clients:
-        sentences.append(f"no client may connect yet; allow one with `{_allow_command(args.dir.absolute())}`")
+        sentences.append(f"no client may connect yet; allow one with {keys_command('allow FILE', args.dir.absolute())}")
     return print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
-
-
-def _allow_command(folder: Path) -> str:
-    """Return the command that allows a client in the folder of the daemon's keys; root writes the usual one."""
-    if folder == SERVER_FOLDER:
-        return "sudo shearloop keys allow FILE"
-    return f"shearloop keys allow FILE --dir {shlex.quote(str(folder))}"
 
 
 def _check_name(name: str) -> None:

@@ -221,7 +221,7 @@ class FrameParser(Parser[Frame]):
             return True
         self._count_refused(FrameErrorKind.TOO_SOON)
         every = f"after {max(after_ns, 0) / 1e9:.3f} s, where one comes every {period_ns / 1e9:.2g} s"
-        cure = "if that goes on, see `frame_period_s`, and what keeps the board or this computer busy"
+        cure = "if that goes on, see `frame_period_s`, and what keeps the board or its computer busy"
         self.refusal = Hint(f"refused {FrameErrorKind.TOO_SOON.value} ({every})", cure)
         return False
 

@@ -94,7 +94,7 @@ class FaultCode(Enum):
         _HOLD,
         "the computer or its matching is too slow: {detail}.",
         "`latency_s` of `shearloop listen eit.estimate` is the time that a fingertip's matching takes, with its wait. "
-        "End other programs on this computer, or build a bank with fewer cells. If the wrist stopped, send "
+        "End other programs on the daemon's computer, or build a bank with fewer cells. If the wrist stopped, send "
         "`shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
@@ -103,8 +103,8 @@ class FaultCode(Enum):
     WRENCH_UNKNOWN = Rule(
         _HOLD,
         "the robot's states come too rarely for a torque of its wrench: {detail}.",
-        "End other programs on this computer, look at the network, or lower `rate_hz` of the robot's settings. If the "
-        "wrist stopped, send `shearloop command unlock`.",
+        "End other programs on the daemon's computer, look at the network, or lower `rate_hz` of the robot's settings. "
+        "If the wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         timer="torque source",
         by_busy_computer=True,
@@ -179,8 +179,8 @@ class FaultCode(Enum):
     STATE_STALE = Rule(
         _HOLD,
         "a device's state is out of date: {detail}.",
-        "It resumes with the next state; check the cable, and whether this computer is overloaded. If the wrist "
-        "stopped, send `shearloop command unlock`.",
+        "It resumes with the next state; check the cable, and whether the daemon's computer is overloaded. If the "
+        "wrist stopped, send `shearloop command unlock`.",
         hold_at_most_s=2.0,
         by_busy_computer=True,
     )
@@ -211,8 +211,8 @@ class FaultCode(Enum):
     ROBOT_UNCONTROLLED = Rule(
         _KEEP,
         "the daemon has lost control of the robot: {detail}.",
-        "If no person stopped it at the pendant, check its cable, and whether this computer is overloaded; then send "
-        "`shearloop command unlock`, and the experiment can begin.",
+        "If no person stopped it at the pendant, check its cable, and whether the daemon's computer is overloaded; "
+        "then send `shearloop command unlock`, and the experiment can begin.",
         by_busy_computer=True,
     )
     TASK_DIED = Rule(
@@ -232,8 +232,8 @@ class FaultCode(Enum):
     LOOP_LATE = Rule(
         _HOLD,
         "the daemon is too slow for its devices: {detail}.",
-        "End other programs on this computer, or see the service's real-time options. If the wrist stopped, send "
-        "`shearloop command unlock`.",
+        "End other programs on the daemon's computer, or see the service's real-time options. If the wrist stopped, "
+        "send `shearloop command unlock`.",
         hold_at_most_s=5.0,
         is_past=True,
         explains=True,

@@ -13,7 +13,14 @@ import zmq
 import zmq.asyncio
 from zmq.utils.monitor import parse_monitor_message
 
-from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
+from shearloop.daemon.messaging.addresses import (
+    LARGEST_PORT,
+    PUBLISH_ADDRESS,
+    READ_ONLY,
+    has_valid_port,
+    how_to_start,
+    needs_keys,
+)
 from shearloop.daemon.messaging.bound_requests import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, decode, encode
@@ -27,6 +34,7 @@ QUIET_S = 3.0
 # A publisher that runs accepts a connection in less.
 PROBE_S = 0.3
 LONGEST_TIMEOUT_S = 86_400.0
+_ALLOW = "`sudo shearloop keys allow FILE` on the daemon's computer"
 
 
 class UnreachedError(UserError):
@@ -146,7 +154,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
             listens = f"a program of this computer listens at {others[0]}: if it is the daemon, give that address"
             return UnreachedError(f"{nothing}: {listens}{_keys_hint(self._keys)}")
         return UnreachedError(
-            f"{nothing}: no daemon publishes there; start it with `shearloop run CONFIG`, or give the address of its "
+            f"{nothing}: no daemon publishes there; {how_to_start(self._address)}, or give the address of its "
             f"`publish` key{_keys_hint(self._keys)}"
         )
 
@@ -308,10 +316,8 @@ def _cure(address: str, keys: ClientKeys | None) -> str:
         return f"a program listens there: if it is the daemon, {_key_cause(keys)} ({options})"
     if others := other_listeners(address):
         return f"a program of this computer listens at {others[0]}: if it is the daemon, give --connect {others[0]}"
-    return (
-        "start it with `shearloop run CONFIG`, or give the address of its `commands` key with --connect"
-        f"{_keys_hint(keys)} ({options})"
-    )
+    address_of = f"the address of its `commands` key with --connect{_keys_hint(keys)} ({options})"
+    return f"{how_to_start(address)}, or give {address_of}"
 
 
 def _end_sentence(stop: Mapping[str, Any]) -> str:
@@ -348,11 +354,11 @@ def _key_cause(keys: ClientKeys | None) -> str:
     """Return why a daemon that is open to the network does not answer."""
     if keys is None:
         return "it answers only with keys"
-    return "your key is not allowed (`sudo shearloop keys allow FILE`), or your server.key is another daemon's"
+    return f"your key is not allowed ({_ALLOW} allows it), or your server.key is another daemon's"
 
 
 def _keys_hint(keys: ClientKeys | None) -> str:
     """Return a hint about keys: a daemon on the network does not answer a wrong key at all."""
     if keys is None:
         return "; a daemon with a network address answers only with keys"
-    return "; it answers only keys that `sudo shearloop keys allow FILE` has added"
+    return f"; it answers only keys that {_ALLOW} has added"

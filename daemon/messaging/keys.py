@@ -19,12 +19,16 @@ import zmq.asyncio
 from zmq.auth.certs import load_certificate
 from zmq.utils import z85
 
+from shearloop.daemon.messaging.addresses import SERVER_KEYS, keys_command
 from shearloop.errors import UserError
 from shearloop.files import read_file
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
-_WHO_MAKES_KEYS = "`sudo shearloop keys server` makes the daemon's keys, `shearloop keys client` a client's"
+# Cures by whose key is missing or damaged: a client's computer is usually another one than the daemon's.
+OWN_CLIENT_CURE = "make one with `shearloop keys client`"
+COPIED_SERVER_CURE = f"copy the daemon's server.key there, which its computer usually has in {SERVER_KEYS}"
+CLIENTS_PUBLIC_CURE = "take the client.key that `shearloop keys client` has made on the client's computer"
 _LARGEST_KEY_BYTES = 1 << 14
 
 
@@ -53,7 +57,8 @@ class ClientKeys:
     @classmethod
     def load(cls, key: str | Path, server_key: str | Path) -> Self:
         """Return the keys of `client.key_secret` and `server.key`; raises UserError if they are missing or damaged."""
-        return cls(load_key_pair(Path(key)), load_public_key(Path(server_key)))
+        own = load_key_pair(Path(key), OWN_CLIENT_CURE)
+        return cls(own, load_public_key(Path(server_key), COPIED_SERVER_CURE))
 
     def apply(self, socket: "zmq.Socket[Any]") -> None:
         """Make an unconnected socket a CURVE client of that daemon."""
@@ -62,24 +67,28 @@ class ClientKeys:
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.own.secret)
 
 
-def load_public_key(path: Path) -> bytes:
-    """Return the public key of a file; raises UserError if it holds none."""
-    return _load(path)[0]
+def server_cure(folder: Path) -> str:
+    """Return the cure for the daemon's keys in their folder, which may be read on the wrong computer."""
+    return f"on the daemon's computer, {keys_command('server', folder)} makes the daemon's keys"
 
 
-def load_key_pair(path: Path) -> KeyPair:
-    """Return the keys of a `.key_secret` file; raises UserError if they are missing or do not match."""
-    public, secret = _load(path)
+def load_public_key(path: Path, cure: str) -> bytes:
+    """Return the public key of a file; raises UserError, which ends with the cure, if it holds none."""
+    return _load(path, cure)[0]
+
+
+def load_key_pair(path: Path, cure: str) -> KeyPair:
+    """Return the keys of a `.key_secret` file; raises UserError with the cure if they are missing or do not match."""
+    public, secret = _load(path, cure)
     if secret is None:
         raise UserError(f"{path} holds no secret key; give the file that ends in .key_secret")
     if path.stat().st_mode & stat.S_IROTH:
         raise UserError(
             f"{path}: every user of this machine can read the secret key: run "
-            f"`chmod 600 {shlex.quote(str(path))}`, and make a new pair if another user may have read it; "
-            f"{_WHO_MAKES_KEYS}"
+            f"`chmod 600 {shlex.quote(str(path))}`, and make a new pair if another user may have read it; {cure}"
         )
     if zmq.curve_public(secret) != public:
-        raise UserError(f"{path}: its public and its secret key do not match; {_WHO_MAKES_KEYS}")
+        raise UserError(f"{path}: its public and its secret key do not match; {cure}")
     return KeyPair(public, secret)
 
 
@@ -94,8 +103,9 @@ def load_server_keys(configured: Path) -> KeyPair:
     """Return the daemon's own keys; raises UserError if they do not exist yet."""
     path = server_key_file(configured)
     if path != configured and path.read_text(encoding="utf-8", errors="replace").strip() == _NO_CREDENTIAL:
-        raise UserError(f"{configured} does not exist; run `sudo shearloop keys server`, then restart the service")
-    return load_key_pair(path)
+        command = keys_command("server", configured.parent)
+        raise UserError(f"{configured} does not exist; run {command}, then restart the service")
+    return load_key_pair(path, server_cure(configured.parent))
 
 
 def make_key_pair(folder: Path, name: str) -> tuple[Path, Path]:
@@ -149,13 +159,13 @@ def allowed_clients(folder: Path) -> AllowedClients:
     except OSError as error:
         raise UserError(
             f"{folder}: the allowed clients' keys cannot be read: {error.strerror}; "
-            f"`sudo shearloop keys server --dir {shlex.quote(str(folder.parent))}` makes the folder"
+            f"on the daemon's computer, {keys_command('server', folder.parent)} makes the folder"
         ) from error
     names: dict[bytes, str] = {}
     unusable: list[str] = []
     for path in paths:
         try:
-            names[load_public_key(path)] = path.stem
+            names[load_public_key(path, CLIENTS_PUBLIC_CURE)] = path.stem
         except UserError as error:
             unusable.append(str(error))
     return AllowedClients(names, tuple(unusable))
@@ -166,11 +176,12 @@ def check_allowed_clients(folder: Path) -> AllowedClients:
     clients = allowed_clients(folder)
     if not clients.names:
         why = "; ".join(clients.unusable) or f"{folder} holds no key"
-        raise UserError(f"{why}, so no client could connect; allow one with `sudo shearloop keys allow FILE`")
+        command = keys_command("allow FILE", folder.parent)
+        raise UserError(f"{why}, so no client could connect; allow one with {command}")
     return clients
 
 
-def _load(path: Path) -> tuple[bytes, bytes | None]:
+def _load(path: Path, cure: str) -> tuple[bytes, bytes | None]:
     try:
         # A key file is small, no device, and not empty as files of the kernel are, which may have no end.
         if not read_file(path, _LARGEST_KEY_BYTES):
@@ -180,15 +191,15 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
         raise UserError(f"{path}: this user may not read the key; run as its owner, or with sudo") from error
     except OSError as error:
         reason = error.strerror or "there is no such file"
-        raise UserError(f"{path}: the key cannot be read: {reason}; {_WHO_MAKES_KEYS}") from error
+        raise UserError(f"{path}: the key cannot be read: {reason}; {cure}") from error
     except ValueError as error:
-        raise UserError(f"{path} is no key file; {_WHO_MAKES_KEYS}") from error
+        raise UserError(f"{path} is no key file; {cure}") from error
     try:
         sizes = {len(z85.decode(key)) for key in (public, secret) if key is not None}
     except (KeyError, ValueError, struct.error):
         sizes = set()
     if sizes != {32}:
-        raise UserError(f"{path} holds a damaged key; {_WHO_MAKES_KEYS}")
+        raise UserError(f"{path} holds a damaged key; {cure}")
     return public, secret
 
 

@@ -149,7 +149,7 @@ class UrRobot:
             return ""
         return (
             f"the robot's states come at {measured_hz:.0f} Hz, and `rate_hz` of its settings is {rate_hz:g}: end other "
-            "programs on this computer, look at the network, or lower `rate_hz`"
+            "programs on the daemon's computer, look at the network, or lower `rate_hz`"
         )
 
     async def next_state(self) -> messages.RobotState:

@@ -80,6 +80,10 @@ def test_every_row_of_the_safety_table_is_on_the_page(written):
         assert rule.cure in written["faults.md"]
 
 
+def test_a_cure_is_right_for_a_reader_on_another_computer():
+    assert not [rule.cure for rule in TABLE.values() if "this computer" in rule.cure or "this machine" in rule.cure]
+
+
 @asynccontextmanager
 async def printing(*command: object) -> AsyncIterator[asyncio.StreamReader]:
     """Run a program, and yield what it prints."""
@@ -164,7 +168,7 @@ def test_the_key_file_on_the_page_has_the_format_that_keys_writes(keys, written,
     page = tmp_path / "page.key_secret"
     page.write_text(shown)
     page.chmod(0o600)
-    pages, made = load_key_pair(page), load_key_pair(keys / "ada/client.key_secret")
+    pages, made = load_key_pair(page, ""), load_key_pair(keys / "ada/client.key_secret", "")
     text = (keys / "ada/client.key_secret").read_text()
     assert (
         text.replace(made.public.decode(), pages.public.decode()).replace(made.secret.decode(), pages.secret.decode())

@@ -124,7 +124,7 @@ function linkLine() {
     lost: ["✗ VIEWER LOST", `nothing from the viewer for ${age(link.sinceBatch())}; all values are old, and the page reconnects by itself`],
     dead: received
       ? ["✗ DAEMON SILENT", `nothing from it for ${age(link.sinceDaemon())}; all values are old`]
-      : ["✗ NO DAEMON", `no message arrives from ${settings.publish}; start one with \`shearloop run CONFIG\``],
+      : ["✗ NO DAEMON", `no message arrives from ${settings.publish}; start one on the rig's computer with \`shearloop run CONFIG\``],
   }[state];
   put(byId("link-state"), name);
   put(byId("link-reason"), reason);

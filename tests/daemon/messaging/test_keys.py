@@ -75,9 +75,12 @@ def test_a_network_address_needs_existing_keys(config, keys, ran, mistake):
     missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
     path = str(config(commands=NETWORK, curve=missing))
     for command in ("run", "check"):
-        assert "`sudo shearloop keys server` makes the daemon's keys" in mistake(command, path)
+        cure = f"on the daemon's computer, `shearloop keys server --dir {keys}` makes the daemon's keys"
+        assert cure in mistake(command, path)
     ran("keys", "revoke", "ada", "--dir", keys / "keys")
-    assert "holds no key, so no client could connect" in mistake("run", config(commands=NETWORK, curve=curve(keys)))
+    said = mistake("run", config(commands=NETWORK, curve=curve(keys)))
+    assert "holds no key, so no client could connect" in said
+    assert f"allow one with `shearloop keys allow FILE --dir {keys / 'keys'}`" in said
 
 
 def test_check_names_the_allowed_clients_and_files_that_are_no_keys(config, keys, ran):
@@ -210,7 +213,7 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
     shown = result_of("keys", "list", "--dir", folder)
-    assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key").decode()}
+    assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key", "").decode()}
     for arguments, why in (
         (["server"], "exists already"),
         (["allow", str(keys / "ada/client.key"), "--name", "eve"], "is allowed already, as ada"),
@@ -222,6 +225,45 @@ def test_keys_are_made_listed_and_revoked(keys, ran, mistake, result_of):
     assert result_of("keys", "revoke", "ada", "--dir", folder) == {"revoked": "ada"}
     advice = f"no client may connect yet; allow one with `shearloop keys allow FILE --dir {folder}`"
     assert advice in ran("keys", "list", "--dir", folder).out
+
+
+def test_the_cure_of_a_clients_files_makes_no_key_of_another_daemon(keys, mistake):
+    """On the client's computer, `keys server` would make keys that no daemon has."""
+    own, server = keys / "ada/client.key_secret", keys / "keys/server.key"
+    missing, damaged = keys / "none", keys / "damaged"
+    damaged.write_text("no key")
+    for key, server_key, cure in (
+        (missing, server, "make one with `shearloop keys client`"),
+        (damaged, server, "make one with `shearloop keys client`"),
+        (own, missing, "copy the daemon's server.key there"),
+        (own, damaged, "copy the daemon's server.key there"),
+    ):
+        with pytest.raises(UserError) as raised:
+            ClientKeys.load(key, server_key)
+        said = mistake("listen", "--key", key, "--server-key", server_key)
+        for sentence in (str(raised.value), said):
+            assert cure in sentence
+            assert "keys server" not in sentence
+
+
+def test_keys_of_the_daemon_are_made_on_its_computer(tmp_path, keys, mistake):
+    """Somebody may type these on a client's computer."""
+    client, none = keys / "ada/client.key", tmp_path / "none"
+    on_its_computer = f"on the daemon's computer, `shearloop keys server --dir {none}` makes"
+    for arguments in (["allow", client], ["revoke", "ada"], ["list"]):
+        assert on_its_computer in mistake("keys", *arguments, "--dir", none)
+    said = mistake("keys", "allow", none, "--dir", keys / "keys")
+    assert "take the client.key that `shearloop keys client` has made on the client's computer" in said
+
+
+def test_a_daemon_of_another_computer_is_started_there(keys):
+    """Nobody answers at this address (RFC 5737)."""
+    with (
+        Subscriber("tcp://192.0.2.1:7761", timeout_s=0.01, keys=ada(keys)) as subscriber,
+        pytest.raises(UserError, match="start it on its computer with `shearloop run CONFIG`") as raised,
+    ):
+        next(subscriber)
+    assert "`sudo shearloop keys allow FILE` on the daemon's computer" in str(raised.value)
 
 
 def test_the_paths_of_keys_are_whole(ran, tmp_path, monkeypatch):
@@ -250,11 +292,11 @@ def test_a_damaged_key_is_an_error(keys):
         ("", "is no key file"),
         ('public-key = "short"\n', "damaged key"),
         (f'public-key = "{other.public.decode()}"\n', "holds no secret key"),
-        (secret.read_text().replace(load_public_key(secret).decode(), other.public.decode()), "do not match"),
+        (secret.read_text().replace(load_public_key(secret, "").decode(), other.public.decode()), "do not match"),
     ):
         secret.write_text(text)
         with pytest.raises(UserError, match=part):
-            load_key_pair(secret)
+            load_key_pair(secret, "")
 
 
 def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch):
@@ -264,7 +306,7 @@ def test_a_systemd_credential_replaces_the_key_file(keys, tmp_path, monkeypatch)
     secret = keys / "keys/server.key_secret"
     (handed / secret.name).write_text(secret.read_text())
     (handed / secret.name).chmod(0o400)
-    assert load_server_keys(Path("/etc/shearloop/keys/server.key_secret")) == load_key_pair(secret)
+    assert load_server_keys(Path("/etc/shearloop/keys/server.key_secret")) == load_key_pair(secret, "")
     (handed / secret.name).chmod(0o600)
     (handed / secret.name).write_text("none")
     with pytest.raises(UserError, match="run `sudo shearloop keys server`"):
@@ -295,6 +337,6 @@ def test_a_secret_key_that_every_user_can_read_is_named(keys):
     secret = (keys / "keys").rename(keys / "my keys") / "server.key_secret"
     secret.chmod(0o644)
     with pytest.raises(UserError, match=r"every user of this machine can read the secret key: run `chmod 600 '"):
-        load_key_pair(secret)
+        load_key_pair(secret, "")
     secret.chmod(0o600)
-    assert load_key_pair(secret).public == load_public_key(keys / "my keys" / "server.key")
+    assert load_key_pair(secret, "").public == load_public_key(keys / "my keys" / "server.key", "")

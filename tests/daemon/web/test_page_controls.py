@@ -597,7 +597,7 @@ def test_a_missing_daemon_is_shown_with_the_cure(browsed):
     browsed.viewer.start()
     browsed.page.goto(browsed.viewer.url)
     browsed.until("#link-state", "✗ NO DAEMON")
-    assert "start one with `shearloop run CONFIG`" in browsed.text("#link-reason")
+    assert "start one on the rig's computer with `shearloop run CONFIG`" in browsed.text("#link-reason")
     assert "no message" in browsed.text("#torque .age")
     browsed.page.click("#stop")
     browsed.until("#answer", "STOP NOT CONFIRMED: no daemon answered")

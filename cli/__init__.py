@@ -144,7 +144,7 @@ def _run(argv: Sequence[str] | None) -> int:
             status: int = module.run(args)
             return status
     except USER_ERRORS as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        print(f"{program}: {_with_notes(str(error), error)}", file=sys.stderr)
         return EXIT_USAGE
     except MemoryError as error:
         cure = "close other programs, or ask for less at a time"
@@ -154,9 +154,14 @@ def _run(argv: Sequence[str] | None) -> int:
         if not interrupt_is_end:
             # A closed terminal accepts no output.
             with contextlib.suppress(OSError):
-                notes = "".join(f". {note}" for note in getattr(interrupt, "__notes__", ()))
-                print(f"{program}: interrupted before it was done{notes}", file=sys.stderr)
+                said = _with_notes("interrupted before it was done", interrupt)
+                print(f"{program}: {said}", file=sys.stderr)
         return interrupt_status(interrupt)
+
+
+def _with_notes(sentence: str, error: BaseException) -> str:
+    notes = getattr(error, "__notes__", ())
+    return ". ".join([sentence.removesuffix("."), *notes]) if notes else sentence
 
 
 def _overview() -> argparse.ArgumentParser:

@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.report_in_use import commissioning_of
     from shearloop.daemon.rig import open_settings
     from shearloop.tools.commission.context import Counts
-    from shearloop.tools.commission.operator import KEPT, Operator
+    from shearloop.tools.commission.operator import Operator
     from shearloop.tools.commission.procedure import commission
 
     config = load_daemon_config(args.config)
@@ -78,11 +78,7 @@ def run(args: argparse.Namespace) -> int:
         allows = config.emulated or sys.stdin.isatty()
         operator = Operator(terminal.answer, terminal.say, order, allows)
         with operator.word.watched():
-            try:
-                report, page = commission(config, args.config, args.out, operator, counts, args.stages)
-            except KeyboardInterrupt as interrupt:
-                interrupt.add_note(KEPT)
-                raise
+            report, page = commission(config, args.config, args.out, operator, counts, args.stages)
         sentences = [f"{label}{args.out} and {page} are written."]
         settings = open_settings(config)
         if settings is not None:
@@ -146,7 +142,5 @@ class Terminal:
         self.say(question)
         line = sys.stdin.readline()
         if not line:
-            raise UserError(
-                "the input ended before all was answered; run it again to continue, and answer each question"
-            )
+            raise UserError("the input ended before all was answered: answer each question")
         return line

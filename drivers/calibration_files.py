@@ -28,4 +28,4 @@ def load_device_calibration(path: Path, model: type[ModelT]) -> ModelT:
 
 def save_calibration(path: Path, calibration: CalibrationModel) -> None:
     """Write the calibration; DeviceCalibrationError names a file that cannot be written."""
-    save_yaml(path, calibration.model_dump(mode="json"), DeviceCalibrationError)
+    save_yaml(path, calibration.model_dump(mode="json"), DeviceCalibrationError, "calibration")

@@ -40,7 +40,7 @@ Commands, one a line on standard input:
   silence DEVICE [SECONDS]    silence a device: right, left, load, skin, gripper, robot
   unplug DEVICE [SECONDS]     disconnect a device, without a number until `replug DEVICE`
   weigh NM                    add a torque to the load cell's, on top of the tool's
-  flip load|FINGERTIP         turn the sign of the load cell, or of a fingertip's shear
+  flip load|FINGERTIP         turn the sign of the load cell, or of a fingertip's shear, until `normal`
   right|left FAULT            any fault of `emulate eit-kit`, for instance right cut-line
   load FAULT                  any fault of `emulate hx711`, for instance load spike
   skin FAULT                  any fault of `emulate skin`, for instance skin short 1

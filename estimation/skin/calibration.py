@@ -188,7 +188,7 @@ class SkinCalibration(BaseModel):
 
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:
     """Write a calibration as YAML, replacing the file at once."""
-    save_yaml(path, {"format": FORMAT, **calibration.model_dump()}, CalibrationError)
+    save_yaml(path, {"format": FORMAT, **calibration.model_dump()}, CalibrationError, "calibration")
 
 
 def load_calibration(path: Path) -> SkinCalibration:

@@ -133,10 +133,12 @@ def load_model(
     return Document.read(path, raises, what, cure, model=model).model(model)
 
 
-def save_yaml(path: Path, content: Mapping[str, Any], raises: type[Exception]) -> None:
-    """Write the content atomically: a reader sees the old file or the new one."""
+def save_yaml(
+    path: Path, content: Mapping[str, Any], raises: type[Exception], what: str, cure: str = "choose another path"
+) -> None:
+    """Write the content atomically: a reader sees the old file or the new one. `what` names the file in an error."""
     try:
         with replace_file(path) as file:
             file.write(yaml.safe_dump(content, sort_keys=False, allow_unicode=True).encode())
     except OSError as error:
-        raise raises(f"{path}: the calibration cannot be written: {error.strerror}") from error
+        raise raises(f"{path}: the {what} cannot be written: {error.strerror}; {cure}") from error

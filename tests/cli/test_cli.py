@@ -39,6 +39,7 @@ from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.sensing.sessions import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.torques import WRENCH
+from shearloop.errors import UserError
 from shearloop.tools.recordings.time_formats import STREAM_VARIABLES
 from shearloop.tools.task_row import task_row
 from tests.fixtures.robots import write_filled_in
@@ -298,16 +299,21 @@ def test_an_interrupted_command_reports_it_unless_it_only_waits(number, status, 
     assert ran("emulate", "rig", "--bank", "my.bank", "--run-dir", tmp_path, status=status) == ("", "")
 
 
-def test_an_interrupted_commissioning_says_how_to_continue(monkeypatch, ran, config, tmp_path):
-    def interrupted(*_: object) -> NoReturn:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (KeyboardInterrupt(), 130, "interrupted before it was done"),
+        (UserError("No robot answers."), 2, "No robot answers"),
+    ],
+)
+def test_the_end_of_a_commissioning_says_what_is_kept(error, status, said, monkeypatch, ran, config, tmp_path):
+    def ends(*_: object) -> NoReturn:
+        error.add_note("Run it again to continue")
+        raise error
 
-    monkeypatch.setattr("shearloop.tools.commission.procedure.commission", interrupted)
-    said = ran("commission", config(), "--out", tmp_path / "report.yaml", status=130).err
-    assert said == (
-        "shearloop commission: interrupted before it was done. What is measured so far is kept; run it again to "
-        "continue\n"
-    )
+    monkeypatch.setattr("shearloop.tools.commission.procedure.commission", ends)
+    found = ran("commission", config(), "--out", tmp_path / "report.yaml", status=status).err
+    assert found == f"shearloop commission: {said}. Run it again to continue\n"
 
 
 def test_a_closed_terminal_causes_no_traceback(monkeypatch, ran):

@@ -45,3 +45,9 @@ def test_help_names_every_fault(device, faults):
 def test_help_of_the_robot_lists_its_faults_and_no_others():
     listed = re.findall(r"^  ([a-z-]+)", help_of("ur"), re.MULTILINE)
     assert sorted(listed) == sorted(FAULTS)
+
+
+def test_help_says_how_a_flipped_sign_is_turned_back():
+    """A second `flip` does not turn it back."""
+    (line,) = (line for line in help_of("rig").splitlines() if line.lstrip().startswith("flip"))
+    assert "until `normal`" in line

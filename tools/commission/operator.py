@@ -12,8 +12,6 @@ WORD: Final = "move"
 DONE: Final = "done"
 # The word by which the operator accepts something that was not tried before.
 GO_ON: Final = "continue"
-# The end of a sentence that ends the commissioning: the report is written after each stage.
-KEPT: Final = "What is measured so far is kept; run it again to continue"
 # Answers that end the commissioning at once, an empty line among them.
 _NO: Final = ("", "no")
 # Wrong answers until the commissioning ends.
@@ -70,7 +68,7 @@ class Operator:
             if answer := self.ask(question):
                 return answer
             self.say("Nothing was typed.")
-        raise UserError(f"nothing was typed: {question.removesuffix(':')}. {KEPT}")
+        raise UserError(f"nothing was typed: {question.removesuffix(':')}")
 
     def number(self, question: str, low: float, high: float, played: Played | None = None) -> float:
         """Return a number within a range; raises UserError after some other answers."""
@@ -82,7 +80,7 @@ class Operator:
             with_point = answer.replace(",", ".")
             cure = f": write {with_point}" if "," in answer and _number(with_point) is not None else ""
             self.say(f"{answer!r} is no number from {low:g} to {high:g}{cure}.")
-        raise UserError(f"no number from {low:g} to {high:g} was given: {question}. {KEPT}")
+        raise UserError(f"no number from {low:g} to {high:g} was given: {question}")
 
     def choose(self, question: str, choices: Sequence[str], played: Played | None = None) -> str:
         """Return the chosen word; raises UserError after some other answers."""
@@ -91,7 +89,7 @@ class Operator:
             if answer in choices:
                 return answer
             self.say(f"{answer!r} is not {' or '.join(f'`{choice}`' for choice in choices)}.")
-        raise UserError(f"neither {' nor '.join(choices)} was given: {question.removesuffix(':')}. {KEPT}")
+        raise UserError(f"neither {' nor '.join(choices)} was given: {question.removesuffix(':')}")
 
     def allow(self, motion: str) -> None:
         """Show a motion with its speed and travel, and return once the word was typed; raises DeclinedError.
@@ -128,14 +126,16 @@ class Operator:
 
     def _confirm(self, question: str, word: str, declined: str) -> None:
         """Return once the word was typed. A word that is misspelt is asked for again; raises DeclinedError."""
+        cause = f"another word than `{word}` was typed {_MAX_TRIES} times"
         for _ in range(_MAX_TRIES):
             answer = self.ask(question)
             if answer == word:
                 return
             if answer in _NO:
+                cause = f"`{answer}` was typed" if answer else "nothing was typed"
                 break
             self.say(f"{answer!r} is not `{word}`, so that nothing was done. `no` ends the commissioning here.")
-        raise DeclinedError(f"{declined.removesuffix('.')}. {KEPT}")
+        raise DeclinedError(f"{cause}, so this was {declined.removesuffix('.')}")
 
     def _with_hint(self, question: str, played: Played | None) -> str:
         """Return the question with what the emulated devices do, if there are any, before its last character."""

@@ -22,15 +22,8 @@ from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.limits import EMULATED
 from shearloop.tools.commission.operator import Operator
 from shearloop.tools.commission.remembered import LeftRobot
-from shearloop.tools.commission.report import (
-    Measured,
-    earlier_report,
-    page_path,
-    report_for,
-    save_report,
-    with_stage,
-    without_stage,
-)
+from shearloop.tools.commission.report import Measured, page_path, report_for, with_stage, without_stage
+from shearloop.tools.commission.report_file import ReportFile
 from shearloop.tools.commission.rig import ConnectedRig, Rig
 from shearloop.tools.commission.tactile import calibrated_sessions
 from shearloop.tools.outputs import check_apart
@@ -69,11 +62,12 @@ def commission(
     settings = open_settings(config)
     if settings is None:
         raise UserError(f"{path} has no robot to commission: add `robot: ur.yaml`")
-    # Before any device is asked: it may be the name of another file.
-    earlier = earlier_report(out)
     check_apart("--out", page_path(out), [(f"the configuration {path}", path)])
-    _open_files(config)
     with ExitStack() as opened:
+        # Before any device is asked: it may be the name of another file.
+        file = opened.enter_context(ReportFile.opened(out))
+        earlier = file.written
+        _open_files(config)
         # A daemon would drive the robot at the same time.
         files = RobotFiles(settings.host)
         opened.enter_context(lock_robot(files, gripper=config.gripper_address))
@@ -87,7 +81,8 @@ def commission(
         report = report_for(rig_identity, earlier, out)
         report = _without_changed(report, config, operator, only)
         context = Context(config, settings, devices, controller, operator, report, counts, opened)
-        return _run(context, left, out, only)
+        with file.saying_what_is_kept():
+            return _run(context, left, file, only)
 
 
 def _open_files(config: DaemonConfig) -> None:
@@ -119,7 +114,7 @@ def _without_changed(report: Report, config: DaemonConfig, operator: Operator, o
     return report
 
 
-def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> tuple[Report, Path]:
+def _run(context: Context, left: LeftRobot, file: ReportFile, only: Sequence[str]) -> tuple[Report, Path]:
     operator = context.operator
     if context.config.emulated:
         times = ", and its limits on times allow for a busy computer" if context.limits is EMULATED else ""
@@ -137,6 +132,7 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
         if failed := [one for one in context.report.stages if not one.passed and one.number < number]:
             raise UserError(f"stage {failed[0].stage} failed: mend it and run it again before stage {stage}")
         operator.say(f"Stage {stage}")
+        file.begin(stage, [one for one in map(stage_number, STAGES) if one in only and one >= number])
         if stage != identity.STAGE:
             # A daemon of another computer may have begun since the last stage.
             context.expect_no_other_program()
@@ -151,14 +147,15 @@ def _run(context: Context, left: LeftRobot, out: Path, only: Sequence[str]) -> t
             judged_sha256s=judged_by(number, judged_sha256s(context.config)),
         )
         context.report = with_stage(context.report, result)
-        save_report(out, context.report, not_measured(context.report))
+        # First, because the disk may be full.
         for line in result.lines:
             limit = f" (limit: {line.limit})" if line.limit else ""
             operator.say(f"{line.verdict:<6} {line.what}: {line.value}{limit}")
+        file.save(context.report, not_measured(context.report))
         if not result.passed:
             operator.say(f"Stage {stage} failed: mend the cause, and run the commissioning again.")
             break
-    page = save_report(out, context.report, not_measured(context.report))
+    page = file.save(context.report, not_measured(context.report))
     return context.report, page
 
 

@@ -13,8 +13,11 @@ from shearloop.daemon.commissioning_report import Line, Report, RigIdentity, Sta
 from shearloop.daemon.report_validity import MAX_AGE_DAYS, load_report
 from shearloop.daemon.supplied_values import NOTHING_SUPPLIED, Supplied
 from shearloop.errors import UserError
+from shearloop.files import replace_file
 from shearloop.yaml_files import save_yaml
 
+# How each page begins.
+PAGE_BEGINS = b"<!doctype html><html lang='en'>"
 COLUMNS = ("what", "value", "limit", "count", "promise", "verdict")
 
 
@@ -43,7 +46,7 @@ def page_of(report: Report, unmeasured: Sequence[str] = ()) -> str:
     rig = report.rig
     title = f"{'EMULATED: ' if rig.emulated else ''}commissioning"
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>"
+        f"{PAGE_BEGINS.decode()}<head><meta charset='utf-8'>"
         "<meta name='viewport' content='width=device-width, initial-scale=1'>",
         f"<title>{title}</title><style>{_STYLE}</style></head><body><h1>{title}</h1>",
         "<p>Every device was emulated: this report raises no limit of a real robot.</p>" if rig.emulated else "",
@@ -127,10 +130,25 @@ def page_path(report: Path) -> Path:
 
 def save_report(path: Path, report: Report, unmeasured: Sequence[str] = ()) -> Path:
     """Write the report, and its page into the same folder; return the page's path."""
-    save_yaml(path, report.model_dump(mode="json", exclude_none=True), UserError)
+    write_report(path, report)
+    return write_page(path, report, unmeasured)
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write the report; raises UserError where that fails, and an earlier report is then unchanged."""
+    content = report.model_dump(mode="json", exclude_none=True)
+    save_yaml(path, content, UserError, "report", "make room there, or make the folder writable")
+
+
+def write_page(path: Path, report: Report, unmeasured: Sequence[str] = ()) -> Path:
+    """Write the page of a report that is written, and return its path; raises UserError where that fails."""
     page = page_path(path)
     try:
-        page.write_text(page_of(report, unmeasured), encoding="utf-8")
+        with replace_file(page) as file:
+            file.write(page_of(report, unmeasured).encode())
     except OSError as error:
-        raise UserError(f"{page} cannot be written: {error.strerror}; choose another --out") from error
+        raise UserError(
+            f"{page}: the page of the report cannot be written: {error.strerror}; make room there, or make the folder "
+            f"writable. The report {path} is whole"
+        ) from error
     return page

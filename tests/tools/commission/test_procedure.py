@@ -138,7 +138,7 @@ def failed(report) -> list[str]:
 @pytest.mark.long
 def test_the_whole_procedure_runs_unattended_and_its_report_supplies_what_it_measured(lab):
     lab.operator.declined = "wrist 3 turns 4 times"
-    with pytest.raises(DeclinedError, match="is kept"):
+    with pytest.raises(DeclinedError, match="`no` was typed"):
         lab.run()
     lab.operator.declined = ""
     report, page = lab.run()

@@ -1,7 +1,10 @@
 """The order of the stages: what is measured is kept, a failed stage ends it, and a later run continues."""
 
+import errno
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -206,3 +209,146 @@ def test_a_stage_that_does_not_exist_and_an_empty_name_are_refused(tmp_path):
     with pytest.raises(UserError, match="nothing was typed: Your name"):
         run("", "")
     assert not out.exists()
+
+
+def declines(context: Context) -> Measured:
+    context.operator.act("Look at the rig")
+    raise AssertionError
+
+
+def gives_no_number(context: Context) -> Measured:
+    context.operator.number("Its width in mm", 0.5, 85.0)
+    raise AssertionError
+
+
+def is_interrupted(_: Context) -> Measured:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize("ends", [declines, gives_no_number, is_interrupted])
+def test_the_end_within_a_stage_says_what_is_in_the_report_and_what_is_measured_again(tmp_path, monkeypatch, ends):
+    play_stages(monkeypatch, dict.fromkeys(("0 a", "3 b", "4 c", "6 d"), "passed"))
+    path, out = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml"
+
+    def run(only: str, *, fails_in: str = "") -> str:
+        with monkeypatch.context() as changed:
+            if fails_in:
+                changed.setitem(procedure.STAGES, fails_in, ends)
+            answers = {"Your name:": "Ada"}
+            operator = Operator(
+                lambda question: WORD if "MOTION" in question else answers.get(question, "x"), [].append, allows=True
+            )
+            try:
+                procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
+            except (UserError, KeyboardInterrupt) as error:
+                return "".join(error.__notes__)
+            return ""
+
+    again = "is measured again from its beginning"
+    said = run("", fails_in="0 a")
+    assert said == f"Nothing is written: {out} does not exist. Run it again to continue: stage 0 a {again}"
+    assert not out.exists()
+    said = run("", fails_in="4 c")
+    assert said == f"{out} has the stages 0 a, 3 b. Run it again to continue: stage 4 c {again}"
+    assert [one.stage for one in load_report(out).stages] == ["0 a", "3 b"]
+    assert run("") == ""
+    said = run("346", fails_in="4 c")
+    assert f"Run it again with `--stages 46` to continue: stage 4 c {again}, and has its earlier result" in said
+    assert [one.stage for one in load_report(out).stages] == ["0 a", "3 b", "4 c", "6 d"]
+
+
+def no_space_for(ending: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the disk be full for files of this ending."""
+
+    def fsync(handle: int) -> None:
+        if os.readlink(f"/proc/self/fd/{handle}").endswith(ending):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("os.fsync", fsync)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+@pytest.mark.parametrize(
+    ("full", "kept", "cause"),
+    [
+        (".yaml.tmp", ["0 a"], "report.yaml: the report cannot be written: No space left on device"),
+        (".html.tmp", ["0 a", "1 b"], "report.html: the page of the report cannot be written: No space left on device"),
+    ],
+)
+@pytest.mark.parametrize("has_page", [True, False])
+def test_a_full_disk_after_a_stage_loses_no_line_and_names_its_file(tmp_path, monkeypatch, full, kept, cause, has_page):
+    play_stages(monkeypatch, {"0 a": "passed", "1 b": "passed"})
+    path, out, said = write_rig(tmp_path, "127.0.0.9"), tmp_path / "report.yaml", []
+    page = out.with_suffix(".html")
+
+    def run(only: str) -> None:
+        operator = Operator(lambda _: WORD, said.append, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), only, RIG)
+
+    run("0")
+    earlier = page.read_text()
+    if not has_page:
+        page.unlink()
+    said.clear()
+    with monkeypatch.context() as disk:
+        no_space_for(full, disk)
+        with pytest.raises(UserError, match=cause) as refused:
+            run("1")
+    assert "choose another" not in str(refused.value)
+    assert "passed w: v" in said
+    assert [one.stage for one in load_report(out).stages] == kept
+    assert f"{', '.join(kept)}. Run it again" in refused.value.__notes__[0]
+    assert ("stage 1 b is measured again" in refused.value.__notes__[0]) == (kept == ["0 a"])
+    assert (page.read_text() if page.exists() else None) == (earlier if has_page else None)
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_report_that_cannot_be_written_is_refused_before_the_first_question(tmp_path):
+    path, asked = write_rig(tmp_path, "127.0.0.9"), []
+    page = tmp_path / "mine.html"
+    page.write_text("<html>my own page")
+    (tmp_path / "folder").mkdir()
+
+    def refusal(out: Path) -> str:
+        operator = Operator(asked.append, asked.append, allows=True)
+        with pytest.raises(UserError) as refused:
+            procedure.commission(load_daemon_config(path), path, out, operator, Counts(), (), RIG)
+        return str(refused.value)
+
+    assert "there is no folder" in refusal(tmp_path / "none" / "report.yaml")
+    assert "is a folder" in refusal(tmp_path / "folder")
+    assert "mine.html exists and is not the page of a report" in refusal(page.with_suffix(".yaml"))
+    # No file with the ending of a lock fits there.
+    assert "the report cannot be written: File name too long" in refusal(tmp_path / f"{'r' * 250}.yaml")
+    assert asked == []
+    assert page.read_text() == "<html>my own page"
+
+
+@pytest.mark.usefixtures("ur_rtde")
+def test_a_second_commissioning_into_the_same_report_is_refused(tmp_path, monkeypatch):
+    """The one that ended last wrote its report over the other's stage."""
+    first, second, out = tmp_path / "first", tmp_path / "second", tmp_path / "report.yaml"
+    link = tmp_path / "link.yaml"
+    link.symlink_to(out)
+    refused: list[str] = []
+
+    def commission(folder: Path, host: str, out: Path, answer: Callable[[str], str]) -> None:
+        folder.mkdir(exist_ok=True)
+        path = write_rig(folder, host)
+        operator = Operator(answer, lambda _: None, allows=True)
+        procedure.commission(load_daemon_config(path), path, out, operator, Counts(), (), RIG)
+
+    def answer(_: str) -> str:
+        for name in (out, link):
+            with pytest.raises(UserError) as error:
+                commission(second, "127.0.0.8", name, lambda _: WORD)
+            refused.append(str(error.value))
+        return WORD
+
+    play_stages(monkeypatch, {"0 a": "passed"})
+    commission(first, "127.0.0.9", out, answer)
+    assert all(said.startswith("another `shearloop commission` writes the report") for said in refused)
+    assert len(refused) == 4
+    assert [one.stage for one in load_report(out).stages] == ["0 a"]
+    assert not list(tmp_path.glob("*.lock"))

@@ -11,6 +11,7 @@ from shearloop.errors import UserError
 from shearloop.estimation.estimator_names import DEFAULT, ESTIMATORS
 
 if TYPE_CHECKING:
+    from shearloop.drivers.calibration_files import CalibrationModel
     from shearloop.estimation import Calibration, FrameSeries
 
 # A larger delay belongs to another recording.
@@ -63,6 +64,21 @@ def check_recipe(args: argparse.Namespace, recordings: Sequence[Path]) -> None:
     ):
         if given is not None and any(folders):
             raise UserError(f"{option} is for recordings: {why}; leave it out")
+
+
+def save_measured(out: Path, calibration: "CalibrationModel") -> None:
+    """Write a calibration that a person has measured; a DeviceCalibrationError shows what was not written."""
+    import yaml
+
+    from shearloop.drivers.calibration_files import save_calibration
+    from shearloop.drivers.errors import DeviceCalibrationError
+
+    try:
+        save_calibration(out, calibration)
+    except DeviceCalibrationError as error:
+        content = yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+        error.add_note(f"Write what was measured into a file yourself:\n{content.strip()}")
+        raise
 
 
 def load_calibration(path: Path) -> "Calibration":

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.cli.calibrations import save_measured
 from shearloop.cli.options import PORT, TOOL_MM, add_json, add_option
 from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
@@ -47,7 +48,6 @@ def run(args: argparse.Namespace) -> int:
     """Grip each object and write the calibration."""
     from shearloop.daemon.rig_memory import Remembered, read_memories
     from shearloop.daemon.robot_files import RobotFiles, lock_gripper
-    from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.hosts import why_no_address
     from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         gauges = asyncio.run(_grip(gripper, args.diameter_mm, operator, left))
     calibration = fit_width(gauges, args.model)
     replaced = args.out.exists()
-    save_calibration(args.out, calibration)
+    save_measured(args.out, calibration)
     report = {
         "path": str(args.out),
         "calibration": calibration.model_dump(mode="json"),

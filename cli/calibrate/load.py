@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shearloop.cli.calibrations import save_measured
 from shearloop.cli.options import add_json, add_option, number
 from shearloop.cli.output_paths import output_path, written_to
 from shearloop.cli.terminal import Operator, print_result
@@ -44,7 +45,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure each load and write the calibration."""
-    from shearloop.drivers.calibration_files import save_calibration
     from shearloop.drivers.connection import SerialPort, find_port
     from shearloop.drivers.load_cell import BAUD_RATE
     from shearloop.drivers.load_cell_calibration import check_masses, fit_levels
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
         levels = asyncio.run(measure(port, args.mass_g, Operator(stdout_is_for_json=args.json)))
     result = fit_levels(levels, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
-    save_calibration(args.out, result.calibration)
+    save_measured(args.out, result.calibration)
     report = {
         "path": str(args.out),
         "calibration": result.calibration.model_dump(mode="json"),

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import errno
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -12,6 +14,7 @@ from itertools import cycle
 from types import SimpleNamespace
 
 import pytest
+import yaml
 
 from shearloop.cli.calibrate import load
 from shearloop.cli.terminal import Operator
@@ -21,6 +24,7 @@ from shearloop.drivers.calibration_files import load_device_calibration
 from shearloop.drivers.connection import SerialPort
 from shearloop.drivers.errors import DeviceLostError
 from shearloop.drivers.load_cell import LoadCalibration
+from shearloop.drivers.load_cell_calibration import Level, fit_levels
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.widths import WidthCalibration
@@ -371,3 +375,23 @@ def test_a_gripper_socket_fails_on_request():
             client.sendall(b"GET FLT\n")
             assert client.recv(64) == b"FLT 14\n"
         assert "'what' is no command" in gripper.end()[2]
+
+
+def test_what_hands_have_measured_is_shown_where_the_disk_is_full(tmp_path, monkeypatch, mistake):
+    levels = [Level(0.0, 8000.0, 1.0, 50), Level(100.0, 58000.0, 1.0, 50)]
+
+    async def measured(*_: object) -> list[Level]:
+        return levels
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(load, "measure", measured)
+    monkeypatch.setattr("shearloop.drivers.connection.find_port", lambda **_: "port")
+    monkeypatch.setattr("shearloop.drivers.connection.SerialPort", lambda *_: contextlib.nullcontext())
+    monkeypatch.setattr("os.fsync", full)
+    out = tmp_path / "load.yaml"
+    said = mistake("calibrate", "load", "--port", "/dev/none", "--mass-g", "100", "--out", out)
+    cause, shown = said.split(" yourself:\n")
+    assert f"{out}: the calibration cannot be written: No space left on device; choose another path" in cause
+    assert LoadCalibration(**yaml.safe_load(shown)) == fit_levels(levels, 0.035).calibration

@@ -136,7 +136,8 @@ class Commands:
         if "asked_ns" not in request:
             ago_s = (self.now_ns() - self._stopped_ns) / 1e9
             unsure = "and without `asked_ns` nothing shows that this request is of later"
-            return f"a stop came {ago_s:.1f} s ago, {unsure}; {_LOOK_AGAIN}" if ago_s <= _OLDEST_S else None
+            cure = f"{_LOOK_AGAIN} with it, or {_OLDEST_S:g} s after the stop"
+            return f"a stop came {ago_s:.1f} s ago, {unsure}; {cure}" if ago_s <= _OLDEST_S else None
         return f"a stop came after it was asked for; {_LOOK_AGAIN}" if request["asked_ns"] <= self._stopped_ns else None
 
     def _is_for_this_one(self, request: Request) -> bool:

@@ -5,10 +5,9 @@ import contextlib
 import os
 import sys
 from collections.abc import Sequence
-from difflib import get_close_matches
 from typing import Any, NoReturn
 
-from shearloop.cli.registry import COMMANDS, GROUPS, MOVING, OTHER_SPELLINGS, command_module
+from shearloop.cli.registry import COMMANDS, GROUPS, OTHER_SPELLINGS, command_module
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.daemon.messaging.deadlines import boot_ns
 from shearloop.daemon.process import interrupt_status, raise_ending_signals
@@ -22,8 +21,6 @@ os.environ.setdefault("NO_COLOR", "1")
 
 # A person typed the command before the process loaded this module.
 _LOADED_NS = boot_ns()
-# Commands of the daemon that are named, and not carried out, without the word `command`.
-_OF_COMMAND = (MOVING - COMMANDS.keys()) | {"tare"}
 EXIT_OK, EXIT_USAGE = 0, 2
 # Exit statuses of `run` with `stop_when_done`: a fault, or a person, stopped the experiment.
 EXIT_UNFINISHED, EXIT_STOPPED = 3, 4
@@ -61,9 +58,9 @@ class Parser(argparse.ArgumentParser):
             of_type = isinstance(error.__context__, argparse.ArgumentTypeError)
             self._refuse(f"{error.argument_name}{'' if of_type else ':'} {error.message}")
         if extras:
-            near = get_close_matches(extras[0].partition("=")[0], self._option_string_actions, 1)
-            meant = f"; did you mean {near[0]}?" if near else ""
-            self._refuse(f"unrecognized arguments: {' '.join(extras)}{meant}")
+            from shearloop.cli.mistyped import of_extra_words
+
+            self._refuse(of_extra_words(extras, self._option_string_actions))
         for action in self._actions:
             # The types of options that name an output look at the inputs.
             if (check := getattr(action.type, "check", None)) is not None:
@@ -72,32 +69,19 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise UserError with argparse's sentence, and with the choices for each missing word that it names."""
-        words = message.replace(",", " ").split()
-        lists = [
-            f"; {action.metavar or action.dest} is one of {', '.join(map(str, action.choices))}"
-            for action in self._actions
-            if action.required and action.choices and (action.metavar or action.dest) in words
-        ]
-        self._refuse(message + "".join(lists))
+        from shearloop.cli.mistyped import of_missing_words
+
+        self._refuse(of_missing_words(message, self._actions))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value that is not among the choices, with the nearest one."""
-        if action.choices is None or value in action.choices:
-            return
-        known = list(map(str, action.choices))
-        if value in _OF_COMMAND and "command" in known:
-            self._refuse(f"there is no {value!r}; it is `shearloop command {value}`")
-        of = f" of {action.option_strings[-1]}" if action.option_strings else ""
-        # A mistyped word must not become a motion.
-        near = get_close_matches(str(value), [choice for choice in known if choice not in MOVING], 1)
-        self._refuse(f"there is no {value!r}{of}; {f'did you mean {near[0]}?' if near else _there_are(known)}")
+        if action.choices is not None and value not in action.choices:
+            from shearloop.cli.mistyped import of_value
+
+            self._refuse(of_value(action, value))
 
     def _refuse(self, sentence: str) -> NoReturn:
         raise UserError(f"{sentence}; see `{self.prog} --help`")
-
-
-def _there_are(known: Sequence[str]) -> str:
-    return f"there {'is' if len(known) == 1 else 'are'} {', '.join(known)}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,7 +18,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     if installs:
         add_option(parser, "--program", Path, "PATH", "what the service runs; by default this program")
-        parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
+        text = "with or without the real-time options of docs/service.md (default: as it is)"
+        parser.add_argument("--real-time", action=argparse.BooleanOptionalAction, help=text)
         parser.epilog = "Installs unit, user, udev rules, folders and an example configuration (docs/service.md)."
 
 

@@ -15,7 +15,11 @@ from shearloop.errors import UserError
 
 UNIT = "shearloop.service"
 EXAMPLE = "etc/shearloop/shearloop.yaml"
-REAL_TIME = f"etc/systemd/system/{UNIT}.d/realtime.conf"
+_DROP_INS = f"etc/systemd/system/{UNIT}.d"
+# systemd reads these by name, so that the override.conf of `systemctl edit` counts more.
+REAL_TIME = f"{_DROP_INS}/10-realtime.conf"
+# Installed by 0.3.0, and read after override.conf.
+_EARLIER_REAL_TIME = f"{_DROP_INS}/realtime.conf"
 # Target of each file of `systemd/`, relative to the system's root.
 PLACES = {
     "shearloop.sysusers.conf": "etc/sysusers.d/shearloop.conf",
@@ -96,18 +100,17 @@ def hidden_folder(path: Path) -> str:
     return next((folder for folder in _HIDDEN if path.is_relative_to(folder)), "")
 
 
-def install_steps(root: Path, program: Path, *, real_time: bool, running: bool) -> Iterator[Step]:
+def install_steps(root: Path, program: Path, *, real_time: bool | None, running: bool) -> Iterator[Step]:
     """Yield the steps that install the service below `root`; `running`: systemd runs there.
+
+    `real_time` says whether with the real-time options; None keeps them as they are.
 
     Run each step before the next is taken: a step depends on the files that are there.
     """
     contents = {name: service_file(name).encode() for name in PLACES} | {UNIT: unit_for(program).encode()}
     for name, place in PLACES.items():
         yield _write(root / place, contents[name])
-    if real_time:
-        yield _write(root / REAL_TIME, service_file("realtime.conf").encode())
-    else:
-        yield from _remove_real_time(root)
+    yield from _real_time_steps(root, real_time)
     yield _write(root / EXAMPLE, service_file("shearloop.yaml").encode(), keep=True)
     at_root = [] if root == Path("/") else [f"--root={root}"]
     yield _program(["systemd-sysusers", *at_root, "shearloop.conf"], "makes the user and the group shearloop")
@@ -134,6 +137,8 @@ def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:
     for place in reversed(PLACES.values()):
         yield _remove(root / place)
     yield from _remove_real_time(root)
+    if (drop_ins := root / _DROP_INS).exists() and _own_drop_ins(root):
+        yield Step(f"left alone: {drop_ins}, with options of your own")
     yield _remove(root / EXAMPLE, unless_edited=service_file("shearloop.yaml").encode())
     for folder in ("keys/clients", "keys", ""):
         yield _remove(root / "etc/shearloop" / folder)
@@ -159,10 +164,44 @@ def _has_user(root: Path) -> bool:
     return any(line.startswith("shearloop:") for line in users.splitlines())
 
 
+def _real_time_steps(root: Path, wanted: bool | None) -> Iterator[Step]:
+    """Yield the steps that add, renew or remove the real-time options; without a wish, those that are there stay."""
+    earlier, content = root / _EARLIER_REAL_TIME, service_file("realtime.conf").encode()
+    if wanted is False:
+        yield from _remove_real_time(root)
+    elif wanted or (root / REAL_TIME).exists() or earlier.exists():
+        yield _write(root / REAL_TIME, content)
+        if earlier.exists():
+            yield Step(
+                f"remove {earlier}, the same file of an earlier version{_besides(earlier, content)}", earlier.unlink
+            )
+        if wanted is None:
+            yield Step("the real-time options stay; `install --no-real-time` removes them")
+
+
 def _remove_real_time(root: Path) -> Iterator[Step]:
-    if (root / REAL_TIME).exists():
-        yield _remove(root / REAL_TIME)
-        yield _remove((root / REAL_TIME).parent)
+    for place in (REAL_TIME, _EARLIER_REAL_TIME):
+        if (root / place).exists():
+            yield _remove(root / place)
+    if (root / _DROP_INS).exists() and not _own_drop_ins(root):
+        yield _remove(root / _DROP_INS)
+
+
+def _own_drop_ins(root: Path) -> bool:
+    """Return whether a person has added options to the unit, as with `systemctl edit`."""
+    return any(path not in (root / REAL_TIME, root / _EARLIER_REAL_TIME) for path in (root / _DROP_INS).iterdir())
+
+
+def _besides(target: Path, content: bytes) -> str:
+    """Return which lines a file has and its new content has not, and where a person keeps such lines; empty without."""
+    known = content.decode().splitlines()
+    lines = [line.strip() for line in target.read_text(encoding="utf-8", errors="replace").splitlines()]
+    own = [f"`{line}`" for line in lines if line and not line.startswith("#") and line not in known]
+    if not own:
+        return ""
+    in_unit = target.name == UNIT or target.parent.name == f"{UNIT}.d"
+    place = "`sudo systemctl edit shearloop`" if in_unit else f"a file of your own in {target.parent}"
+    return f", which also has {', '.join(own)}; lines of your own go into {place}"
 
 
 def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
@@ -176,7 +215,7 @@ def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
         target.write_bytes(content)
         target.chmod(0o644)
 
-    return Step(f"{'replace' if exists else 'write'} {target}", write)
+    return Step(f"replace {target}{_besides(target, content)}" if exists else f"write {target}", write)
 
 
 def _remove(target: Path, unless_edited: bytes | None = None) -> Step:

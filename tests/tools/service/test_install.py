@@ -7,10 +7,22 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.tools.service import EXAMPLE, PLACES, REAL_TIME, find_program, in_system, install_steps, service_file
+from shearloop.tools.service import (
+    EXAMPLE,
+    PLACES,
+    REAL_TIME,
+    UNIT,
+    find_program,
+    in_system,
+    install_steps,
+    service_file,
+    uninstall_steps,
+)
 
 # In the other system, and not on this computer.
 PROGRAM = "/opt/shearloop-of-the-image/bin/shearloop"
+# The real-time options of 0.3.0.
+EARLIER = f"etc/systemd/system/{UNIT}.d/realtime.conf"
 
 
 def files(root: Path) -> set[str]:
@@ -73,11 +85,82 @@ def test_edited_files_stay(tmp_path, place):
     edited.write_text("fingertips: {}\n")
     key = tmp_path / "etc/shearloop/keys/server.key_secret"
     key.write_text("secret")
-    place("install")
-    assert not (tmp_path / REAL_TIME).parent.exists(), "real-time options go when they are not asked for"
+    place("install", "--no-real-time")
+    assert not (tmp_path / REAL_TIME).parent.exists()
     assert f"left because it was edited: {edited}" in place("uninstall")
     assert edited.read_text() == "fingertips: {}\n"
     assert key.exists()
+
+
+@pytest.fixture
+def installed(tmp_path) -> Callable[[bool | None], list[str]]:
+    """Return a function that installs the files of the service in `tmp_path`, and returns the sentences."""
+
+    def install(real_time: bool | None) -> list[str]:
+        said = []
+        for step in install_steps(tmp_path, Path(PROGRAM), real_time=real_time, running=False):
+            said.append(step.sentence)
+            if step.run is not None and not step.sentence.startswith("run "):
+                step.run()
+        return said
+
+    return install
+
+
+def uninstalled(root: Path) -> list[str]:
+    said = []
+    for step in uninstall_steps(root, running=False):
+        said.append(step.sentence)
+        if step.run is not None and not step.sentence.startswith("run "):
+            step.run()
+    return said
+
+
+def test_an_upgrade_keeps_the_real_time_options_and_says_so(tmp_path, installed):
+    options = tmp_path / REAL_TIME
+    assert not any("real-time" in sentence for sentence in installed(None))
+    assert not options.exists()
+    installed(True)
+    said = installed(None)
+    assert f"left as it is: {options}" in said
+    assert "the real-time options stay; `install --no-real-time` removes them" in said
+    assert options.read_text() == service_file("realtime.conf")
+    assert f"remove {options}" in installed(False)
+    assert not options.parent.exists()
+
+
+def test_options_of_a_persons_own_stay_and_count_more(tmp_path, installed):
+    installed(True)
+    # As `systemctl edit` names it.
+    own = (tmp_path / REAL_TIME).with_name("override.conf")
+    own.write_text("[Service]\nCPUAffinity=2 3\nCPUSchedulingPriority=20\n")
+    for real_time in (True, None, False, True):
+        installed(real_time)
+        assert "CPUAffinity=2 3" in own.read_text()
+    assert max(path.name for path in own.parent.iterdir()) == own.name, "systemd reads the last one last"
+    assert f"left alone: {own.parent}, with options of your own" in uninstalled(tmp_path)
+    assert list(own.parent.iterdir()) == [own]
+
+
+@pytest.mark.parametrize("place", [REAL_TIME, EARLIER, PLACES["shearloop.service"], PLACES["60-shearloop.rules"]])
+def test_lines_that_a_person_wrote_into_a_replaced_file_are_named(place, tmp_path, installed):
+    installed(True)
+    edited = tmp_path / place
+    before = edited.read_text() if edited.exists() else service_file("realtime.conf")
+    edited.write_text(before + "# a comment\nCPUAffinity=2 3\n")
+    (sentence,) = [said for said in installed(None) if "CPUAffinity" in said]
+    cure = f"a file of your own in {edited.parent}" if place.endswith(".rules") else "`sudo systemctl edit shearloop`"
+    assert sentence.startswith(("replace ", "remove "))
+    assert sentence.endswith(f", which also has `CPUAffinity=2 3`; lines of your own go into {cure}")
+    assert not any("CPUAffinity" in said for said in installed(None))
+
+
+def test_the_real_time_options_of_an_earlier_version_are_renewed(tmp_path, installed):
+    earlier = tmp_path / EARLIER
+    earlier.parent.mkdir(parents=True)
+    earlier.write_text("[Service]\nCPUSchedulingPolicy=fifo\n")
+    assert f"remove {earlier}, the same file of an earlier version" in installed(None)
+    assert [path.name for path in earlier.parent.iterdir()] == [Path(REAL_TIME).name]
 
 
 @pytest.mark.parametrize("command", ["install", "uninstall"])

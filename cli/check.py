@@ -1,6 +1,7 @@
 """`shearloop check`: check a configuration and the files it names, or an experiment, and print its plan."""
 
 import argparse
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -35,11 +36,14 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.yaml_files import read_yaml
 
     content = read_yaml(args.config, UserError, "file")
+    _refuse_no_section(content, args.config)
     is_experiment = _is_experiment(content)
     if args.rig is not None and not is_experiment:
-        raise UserError(
-            f"{args.config}: this file is a configuration, and --config goes with an experiment; leave --config out"
-        )
+        cure = "leave --config out"
+        with suppress(UserError):
+            if _is_experiment(read_yaml(args.rig, UserError)):
+                cure = f"write `shearloop check {args.rig} --config {args.config}`"
+        raise UserError(f"{args.config}: this file is a configuration, and --config goes with an experiment; {cure}")
     parts = _check_experiment(args.config, args.rig) if is_experiment else _check_configuration(args.config)
     plan_lines = [line for plan in parts.plans for line in plan.sentences()]
     # A rehearsal runs all the same, so the other parts are judged and shown as well.
@@ -74,6 +78,19 @@ def _note_rehearsal(config: "DaemonConfig", path: Path, parts: "Parts") -> None:
         parts.texts[REHEARSAL] = f"refused: {error}"
 
 
+def _refuse_no_section(content: object, path: Path) -> None:
+    """Raise UserError for a file that is neither an experiment nor a configuration, with what it is."""
+    if isinstance(content, dict):
+        return
+    if not isinstance(content, list):
+        cure = "write keys and values such as `robot: ur.yaml`"
+        raise UserError(f"{path}: this file is a text or a number, and no section with keys; {cure}")
+    if any(isinstance(entry, dict) and "do" in entry for entry in content):
+        cure = "write `name: …` and `steps:` above it"
+        raise UserError(f"{path}: this file is a list of steps, and no whole experiment; {cure}")
+    raise UserError(f"{path}: this file is a list, and no section with keys; take out the `-` before each key")
+
+
 def _is_experiment(content: object) -> bool:
     """Return whether a file is meant as an experiment: by its steps, or by most of its keys where one is misspelt."""
     from shearloop.daemon.config import DaemonConfig
@@ -90,7 +107,7 @@ def _is_experiment(content: object) -> bool:
 
 
 def _check_configuration(path: Path) -> "Parts":
-    """Return the parts of a configuration; the mistakes of an invalid one hide none of its experiment's."""
+    """Return the parts of a configuration; the mistakes of an invalid one hide none of the files that it names."""
     from shearloop.cli.emulator_processes import check_emulators
     from shearloop.daemon.config import load_daemon_config
     from shearloop.tools.check import Parts, check_parts
@@ -101,8 +118,7 @@ def _check_configuration(path: Path) -> "Parts":
         parts = check_parts(config, path, check_emulators)
         _note_rehearsal(config, path, parts)
     if "configuration" in parts.mistakes:
-        with parts.of("experiment"):
-            _check_named_experiment(path)
+        _check_named_files(path, parts)
     return parts
 
 
@@ -110,24 +126,42 @@ def _check_experiment(path: Path, rig: Path | None) -> "Parts":
     """Return the plan of an experiment, alone or on the devices of a configuration."""
     from shearloop.cli.emulator_processes import check_emulators
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.tools.check import check_experiment_alone, check_parts
+    from shearloop.tools.check import Parts, check_experiment_alone, check_parts
 
     if rig is None:
         return check_experiment_alone(path)
-    config = load_daemon_config(rig)
-    if config.robot is None:
-        raise UserError(f"{rig}: an experiment needs a robot: add `robot: ur.yaml`")
-    parts = check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
-    _note_rehearsal(config, rig, parts)
+    parts = Parts()
+    with parts.of("configuration"):
+        config = load_daemon_config(rig)
+        if config.robot is None:
+            raise UserError(f"{rig}: an experiment needs a robot: add `robot: ur.yaml`")
+        parts = check_parts(config.model_copy(update={"experiment": path}), rig, check_emulators)
+        _note_rehearsal(config, rig, parts)
+    if "configuration" in parts.mistakes:
+        _check_named_files(rig, parts, path)
     return parts
 
 
-def _check_named_experiment(path: Path) -> None:
-    """Raise UserError for the mistakes of the experiment that an invalid configuration names."""
+def _check_named_files(path: Path, parts: "Parts", experiment: Path | None = None) -> None:
+    """Add the mistakes in the files that an invalid configuration names, or of another `experiment`."""
+    from shearloop.daemon.rig import robot_settings
     from shearloop.tools.check import read_experiment
     from shearloop.yaml_files import read_yaml
 
-    content = read_yaml(path, UserError)
-    named = content.get("experiment") if isinstance(content, dict) else None
-    if named and isinstance(named, str):
-        read_experiment(path.parent / named)
+    content: object = None
+    with suppress(UserError):
+        # This mistake is named already.
+        content = read_yaml(path, UserError)
+    given = content if isinstance(content, dict) else {}
+    named = {key: path.parent / given[key] for key in ("robot", "experiment") if _is_path(given.get(key))}
+    if experiment is not None:
+        named["experiment"] = experiment
+    for key, read in (("robot", robot_settings), ("experiment", read_experiment)):
+        if key in named:
+            with parts.of(key):
+                read(named[key])
+
+
+def _is_path(value: object) -> bool:
+    """Return whether a value of a file can be the path of one."""
+    return isinstance(value, str) and bool(value.strip(" ."))

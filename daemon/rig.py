@@ -144,10 +144,14 @@ def configured_settings(config: DaemonConfig) -> UrSettings | None:
         return None
     settings = robot_settings(config.robot)
     if config.emulated and not is_loopback_host(settings.host):
-        raise UserError(
-            f"{config.robot}: `host: {settings.host}` is not this computer, and the configuration says "
-            "`emulated: true`: take that out for a real robot, or give 127.0.0.1 for an emulated one"
+        # Only a mistake needs the lines of the file.
+        from shearloop.yaml_files import Document
+
+        reason = (
+            f"{settings.host} is not this computer, and the configuration says `emulated: true`: take that out for a "
+            "real robot, or give 127.0.0.1 for an emulated one"
         )
+        raise UserError(*Document.read(config.robot, UserError).located([(("host",), reason)]))
     return with_emulated_deadlines(settings) if is_patient(config) else settings
 
 

@@ -6,6 +6,7 @@ import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -222,7 +223,10 @@ def _check_rig(config: "DaemonConfig", parts: Parts) -> "Commissioning | None":
 
 
 def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
-    """Check that no port is a file, and that recordings can be written; a missing path is accepted."""
+    """Check that no port is a file, that recordings can be written, and that the folders of experiments exist.
+
+    A missing port is accepted: its device may come later.
+    """
     from shearloop.daemon.config import SerialDevice
 
     for key, section in config.walk():
@@ -230,6 +234,8 @@ def _check_paths(config: "DaemonConfig", parts: Parts) -> None:
             parts.mistakes[key] = f"`{key}.path: {section.path}` is {kind}; name a serial port: `shearloop ports`"
     if (recording := config.recording) is not None and (reason := why_not_recorded(recording.folder)):
         parts.mistakes["recording"] = f"`recording.folder: {recording.folder}`: {reason.clause}"
+    if wrong := [f"`experiments`: {folder} {why}" for folder in config.experiments if (why := _no_folder(folder))]:
+        parts.mistakes["experiments"] = "\n".join(wrong)
 
 
 def why_not_recorded(folder: Path) -> Hint | None:
@@ -252,6 +258,19 @@ def why_not_recorded(folder: Path) -> Hint | None:
     if not file_system.f_bavail:
         return Hint(f"the disk of {existing} is full", "free some space, or choose another folder")
     return None
+
+
+def _no_folder(folder: Path) -> str:
+    """Return why no experiment can be in a folder, with the cure, or an empty string."""
+    if folder.is_dir():
+        return ""
+    if folder.exists():
+        return "is a file: name its folder"
+    with suppress(OSError):
+        names = [one.name for one in folder.parent.iterdir() if one.is_dir()]
+        if near := get_close_matches(folder.name, names, 1):
+            return f"does not exist; did you mean {folder.parent / near[0]}?"
+    return "does not exist: make this folder, or name another"
 
 
 def _no_port(path: Path) -> str:

@@ -79,13 +79,14 @@ def _capped_nm(file: ExperimentFile, turn: Turn, cap: MotionCap) -> float:
 def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mistake]:
     """Return each step that exceeds its limits or its timeout, and each step that the steps before it make wrong.
 
-    These are the first `hold_torque` on an unidentified tool, a `tare` of a gripped one, a torque that undoes a
-    `tighten`, a `grip` wider than the one before it, and limits that the tool is beyond as the step begins. No limit
-    above the `cap` is of use.
+    These are limits of a step above the experiment's, the first `hold_torque` on an unidentified tool, a `tare` of a
+    gripped one, a torque that undoes a `tighten`, a `grip` wider than the one before it, and limits that the tool is
+    beyond as the step begins. No limit above the `cap` is of use.
     """
     found: list[Mistake] = [*_undoing(file), *_opening(file), *_begun_beyond_limits(file)]
     identified = gripped = False
     for number, (step, turn) in enumerate(_with_turns(file)):
+        found += _looser_limits(file, number, step)
         found += [(("steps", number), sentence) for sentence in _beyond_own_limits(file, step, turn, cap)]
         if isinstance(step, GripperStep):
             gripped = isinstance(step, GripStep) and step.expect_object
@@ -103,6 +104,20 @@ def check_steps(file: ExperimentFile, cap: MotionCap | None = None) -> list[Mist
                 # One sentence is enough.
                 identified = True
     return found
+
+
+def _looser_limits(file: ExperimentFile, number: int, step: Step) -> Iterator[Mistake]:
+    """Yield each limit of a step that is above the experiment's, which holds all the same."""
+    if step.limits is None:
+        return
+    for key, unit in (("torque_nm", "N·m"), ("angle_rad", "rad")):
+        own, whole = getattr(step.limits, key), getattr(file.limits, key)
+        if key in step.limits.model_fields_set and own > whole + _ROUNDING:
+            yield (
+                ("steps", number, "limits", key),
+                f"the limit of {step.do} is {own:g} {unit}, and the experiment's is {whole:g} {unit}: a step's limits "
+                f"can only be tighter; raise the experiment's limits.{key}, or write {whole:g} or less",
+            )
 
 
 def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap: MotionCap | None) -> Iterator[str]:

@@ -226,6 +226,8 @@ def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
 def _read_array(path: Path, file: BinaryIO, name: str, entry: dict[str, Any]) -> NDArray[Any]:
     """Return one array of the file: the signals mapped, the small ones read."""
     kind, shape, offset = np.dtype(_TYPES[name]), tuple(entry["shape"]), entry["offset"]
+    if offset < 0:
+        raise ValueError(f"{name} begins at {offset}")
     expected, size = offset + kind.itemsize * math.prod(shape), os.fstat(file.fileno()).st_size
     if size < expected or (name == "signals" and size != expected):
         raise _unusable(path, f"the file is truncated or has grown: expected {expected} bytes, found {size}")

@@ -9,7 +9,7 @@ from pathlib import Path
 from shearloop.cli.connection import user_key_folder
 from shearloop.cli.options import add_action, add_json, add_option, run_action
 from shearloop.cli.terminal import print_result
-from shearloop.daemon.messaging.addresses import SERVER_KEYS, keys_command
+from shearloop.daemon.messaging.addresses import SERVER_KEYS
 from shearloop.errors import UserError
 
 run = run_action
@@ -38,7 +38,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def _server(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import make_key_pair, writing_keys
+    from shearloop.daemon.messaging.keys import keys_command, make_key_pair, writing_keys
 
     # A configuration reads paths from its own folder, and this shell may stand in another one.
     folder = args.dir.absolute()
@@ -117,7 +117,7 @@ def _revoke(args: argparse.Namespace) -> int:
 
 
 def _list(args: argparse.Namespace) -> int:
-    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, server_cure
+    from shearloop.daemon.messaging.keys import allowed_clients, keys_command, load_public_key, server_cure
 
     server = load_public_key(args.dir / "server.key", server_cure(args.dir.absolute())).decode()
     allowed = allowed_clients(args.dir / "clients")

@@ -3,7 +3,6 @@
 import errno
 import ipaddress
 import os
-import shlex
 import socket
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -101,22 +100,6 @@ def network_refusal(address: str, key: str) -> str:
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
         f"{usual(key)}, or add `curve` with keys from `sudo shearloop keys server`"
     )
-
-
-def keys_command(action: str, folder: Path) -> str:
-    """Return the command for an action on the daemon's keys in their folder; root writes the usual one.
-
-    Name the daemon's computer beside it: on a client's computer it would make keys of another daemon.
-    """
-    if folder == SERVER_KEYS:
-        return f"`sudo shearloop keys {action}`"
-    return f"`shearloop keys {action} --dir {shlex.quote(str(folder))}`"
-
-
-def how_to_start(address: str) -> str:
-    """Return how a person starts the daemon of an address, which may be on another computer."""
-    where = " on its computer" if needs_keys(address) else ""
-    return f"start it{where} with `shearloop run CONFIG`"
 
 
 def stop_name(address: str) -> bytes:

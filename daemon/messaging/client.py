@@ -13,14 +13,7 @@ import zmq
 import zmq.asyncio
 from zmq.utils.monitor import parse_monitor_message
 
-from shearloop.daemon.messaging.addresses import (
-    LARGEST_PORT,
-    PUBLISH_ADDRESS,
-    READ_ONLY,
-    has_valid_port,
-    how_to_start,
-    needs_keys,
-)
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, PUBLISH_ADDRESS, READ_ONLY, has_valid_port, needs_keys
 from shearloop.daemon.messaging.bound_requests import TYPED_WITHIN_S
 from shearloop.daemon.messaging.keys import ClientKeys
 from shearloop.daemon.messaging.messages import ENVELOPE, TOPICS, decode, encode
@@ -154,7 +147,7 @@ class Subscriber(AbstractContextManager["Subscriber", None], Iterator[TopicConte
             listens = f"a program of this computer listens at {others[0]}: if it is the daemon, give that address"
             return UnreachedError(f"{nothing}: {listens}{_keys_hint(self._keys)}")
         return UnreachedError(
-            f"{nothing}: no daemon publishes there; {how_to_start(self._address)}, or give the address of its "
+            f"{nothing}: no daemon publishes there; {_how_to_start(self._address)}, or give the address of its "
             f"`publish` key{_keys_hint(self._keys)}"
         )
 
@@ -317,7 +310,13 @@ def _cure(address: str, keys: ClientKeys | None) -> str:
     if others := other_listeners(address):
         return f"a program of this computer listens at {others[0]}: if it is the daemon, give --connect {others[0]}"
     address_of = f"the address of its `commands` key with --connect{_keys_hint(keys)} ({options})"
-    return f"{how_to_start(address)}, or give {address_of}"
+    return f"{_how_to_start(address)}, or give {address_of}"
+
+
+def _how_to_start(address: str) -> str:
+    """Return how a person starts the daemon of an address, which may be on another computer."""
+    where = " on its computer" if needs_keys(address) else ""
+    return f"start it{where} with `shearloop run CONFIG`"
 
 
 def _end_sentence(stop: Mapping[str, Any]) -> str:

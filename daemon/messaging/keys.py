@@ -19,9 +19,9 @@ import zmq.asyncio
 from zmq.auth.certs import load_certificate
 from zmq.utils import z85
 
-from shearloop.daemon.messaging.addresses import SERVER_KEYS, keys_command
+from shearloop.daemon.messaging.addresses import SERVER_KEYS
 from shearloop.errors import UserError
-from shearloop.files import read_file
+from shearloop.files import is_missing, read_file
 
 # The unit's `SetCredential` gives this value until the server key exists.
 _NO_CREDENTIAL = "none"
@@ -65,6 +65,16 @@ class ClientKeys:
         socket.setsockopt(zmq.CURVE_SERVERKEY, self.server_public)
         socket.setsockopt(zmq.CURVE_PUBLICKEY, self.own.public)
         socket.setsockopt(zmq.CURVE_SECRETKEY, self.own.secret)
+
+
+def keys_command(action: str, folder: Path) -> str:
+    """Return the command for an action on the daemon's keys in their folder; root writes the usual one.
+
+    Name the daemon's computer beside it: on a client's computer it would make keys of another daemon.
+    """
+    if folder == SERVER_KEYS:
+        return f"`sudo shearloop keys {action}`"
+    return f"`shearloop keys {action} --dir {shlex.quote(str(folder))}`"
 
 
 def server_cure(folder: Path) -> str:
@@ -190,8 +200,8 @@ def _load(path: Path, cure: str) -> tuple[bytes, bytes | None]:
     except PermissionError as error:
         raise UserError(f"{path}: this user may not read the key; run as its owner, or with sudo") from error
     except OSError as error:
-        reason = error.strerror or "there is no such file"
-        raise UserError(f"{path}: the key cannot be read: {reason}; {cure}") from error
+        ending = f"; {cure}" if is_missing(error) else ""
+        raise UserError(f"{path}: the key cannot be read: {error.strerror or error}{ending}") from error
     except ValueError as error:
         raise UserError(f"{path} is no key file; {cure}") from error
     try:

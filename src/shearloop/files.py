@@ -134,18 +134,24 @@ def near_name(path: Path) -> str:
     return f"; did you mean {path.with_name(near[0])}?" if near else ""
 
 
+def is_missing(error: OSError) -> bool:
+    """Return whether there is no file at a path that could not be opened: only then a new one can be made there."""
+    return isinstance(error, FileNotFoundError | NotADirectoryError)
+
+
 @contextmanager
 def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str, missing: str = "") -> Iterator[None]:
     """Turn every error of the block into `raises`: a foreign or damaged file raises many types of exceptions.
 
-    `what` names the file where it cannot be read, which `missing` ends; `damage` says the rest, with {} for the detail.
+    `what` names the file where it cannot be read, and `missing` ends the message where there is none; `damage` says the
+    rest, with {} for the detail.
     """
     try:
         yield
     except raises:
         raise
     except OSError as error:
-        cure = near_name(path) or missing
+        cure = near_name(path) or missing if is_missing(error) else ""
         raise raises(f"{path}: {what} cannot be read: {error.strerror or error}{cure}") from error
     except Exception as error:
         detail = " ".join((repr(error) if isinstance(error, KeyError) else str(error) or repr(error)).split())
@@ -153,18 +159,18 @@ def refusing_damage(path: Path, raises: type[Exception], what: str, damage: str,
 
 
 def open_file(path: Path) -> BinaryIO:
-    """Open a file to read; raises OSError, also for a device or a pipe, which may have no end.
+    """Open a file to read; raises OSError, also for a folder, and for a device or a pipe, which may have no end.
 
     A file without a size is read as an empty one. This includes the kernel's files, because some of them never end,
     such as /proc/kmsg.
     """
     # Opening a device can already change something.
-    _refuse_device(path.stat())
+    _refuse_other_than_file(path.stat())
     # It may be another file by now, and the opening of a pipe waits for a writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         status = os.fstat(handle)
-        _refuse_device(status)
+        _refuse_other_than_file(status)
         if stat.S_ISREG(status.st_mode) and not status.st_size:
             os.close(handle)
             handle = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
@@ -174,8 +180,10 @@ def open_file(path: Path) -> BinaryIO:
         raise
 
 
-def _refuse_device(status: os.stat_result) -> None:
-    if not (stat.S_ISREG(status.st_mode) or stat.S_ISDIR(status.st_mode)):
+def _refuse_other_than_file(status: os.stat_result) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder; name a file in it")
+    if not stat.S_ISREG(status.st_mode):
         raise OSError(errno.EINVAL, "it is a device or a pipe; name a file")
 
 

@@ -12,7 +12,7 @@ from typing import Any, Self
 import yaml
 from pydantic import ValidationError
 
-from shearloop.files import is_possible, read_file, replace_file
+from shearloop.files import is_missing, is_possible, read_file, replace_file
 from shearloop.models import Model, as_model
 from shearloop.words import shown
 from shearloop.yaml_loader import MAX_BYTES, Loader
@@ -51,7 +51,8 @@ class Document:
         except OSError as error:
             from shearloop.yaml_mistakes import meant
 
-            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{meant(path, model)}{cure}") from error
+            ending = f"{meant(path, model)}{cure if is_missing(error) else ''}"
+            raise raises(f"{path}: the {what} cannot be read: {error.strerror}{ending}") from error
         return cls.parse(path, data, raises, what)
 
     @classmethod

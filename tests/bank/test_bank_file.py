@@ -135,7 +135,7 @@ def test_a_missing_bank_names_its_definition(definition, tmp_path):
 def test_foreign_files_other_formats_and_other_channel_tables_are_refused(path, tmp_path):
     with pytest.raises(BankFileError, match=r"none\.bank: the bank cannot be read: No such file.*shearloop bank build"):
         Bank.open(tmp_path / "none.bank")
-    with pytest.raises(BankFileError, match="cannot be read: Is a directory"):
+    with pytest.raises(BankFileError, match="cannot be read: it is a folder; name a file in it"):
         Bank.open(tmp_path)
     (tmp_path / "foreign.bank").write_bytes(b"\x89HDF\r\n" * 2000)
     with pytest.raises(BankFileError, match=r"foreign\.bank: this is not a bank: expected"):

@@ -276,7 +276,7 @@ def test_the_configuration_of_a_folder_is_named_by_its_usual_name(tmp_path):
 def test_files_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(UserError, match=r"none\.yaml: the configuration cannot be read: No such file"):
         load_yaml_model(tmp_path / "none.yaml", Outer)
-    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+    with pytest.raises(UserError, match="cannot be read: it is a folder; name a file in it"):
         load_yaml_model(tmp_path, Outer)
     with pytest.raises(UserError, match="null: the configuration cannot be read: it is a device or a pipe"):
         load_yaml_model(Path("/dev/null"), Outer)

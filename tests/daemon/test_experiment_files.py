@@ -157,7 +157,7 @@ def fifo(folder: Path) -> Path:
     ("place", "why"),
     [
         (lambda folder: folder / "none.yaml", "No such file"),
-        (lambda folder: folder, "Is a directory"),
+        (lambda folder: folder, "it is a folder"),
         (fifo, "it is a device or a pipe"),
         (lambda folder: write(folder / "large.yaml", "#" * 200_000), "it is larger than 32 kB"),
         (lambda folder: folder / ("x" * 300), "File name too long"),

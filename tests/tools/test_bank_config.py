@@ -229,6 +229,13 @@ def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(fo
         (["info", "{folder}/tip.yaml"], "tip.yaml: this is not a bank"),
         (["info", "{folder}/tip.yaml"], "or make one with `shearloop bank build --config FILE --out NAME.bank`"),
         (["info", "{folder}/none"], "none: the bank cannot be read"),
+        (["info", "{folder}"], ": the bank cannot be read: it is a folder; name a file in it\n"),
+        (["info", "/dev/null"], ": the bank cannot be read: it is a device or a pipe; name a file\n"),
+        (
+            ["build", "--config", "{folder}", "--out", "{out}"],
+            "cannot be read: it is a folder; name a file in it; did you",
+        ),
+        ([*SOLVE, "--mesh", "{folder}"], ": the mesh cannot be read: it is a folder; name a file in it\n"),
         ([*SOLVE, "--mesh", "{folder}/none"], "the mesh cannot be read"),
         ([*SOLVE, "--mesh", "{folder}/a.bank"], "is not a mesh"),
         ([*SOLVE, "--model", "x"], "no basis model"),

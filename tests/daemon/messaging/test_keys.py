@@ -246,6 +246,11 @@ def test_the_cure_of_a_clients_files_makes_no_key_of_another_daemon(keys, mistak
             assert "keys server" not in sentence
 
 
+def test_a_folder_is_no_key(keys):
+    with pytest.raises(UserError, match=r"the key cannot be read: it is a folder; name a file in it$"):
+        ClientKeys.load(keys, keys / "keys/server.key")
+
+
 def test_keys_of_the_daemon_are_made_on_its_computer(tmp_path, keys, mistake):
     """Somebody may type these on a client's computer."""
     client, none = keys / "ada/client.key", tmp_path / "none"

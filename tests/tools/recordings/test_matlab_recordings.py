@@ -163,7 +163,7 @@ def test_foreign_files_are_refused(tmp_path, content, says):
         read_stream(path)
     with pytest.raises(UserError, match=r"absent\.mat: the recording cannot be read: No such file"):
         read_stream(tmp_path / "absent.mat")
-    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+    with pytest.raises(UserError, match="cannot be read: it is a folder; name a file in it"):
         read_stream(tmp_path)
 
 

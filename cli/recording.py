@@ -321,5 +321,9 @@ def _import(args: argparse.Namespace) -> int:
         check_new(args.out.with_name(name))
     imported = import_mat(args.sources, args.out, args.time_format)
     counts = [f"{counted(count, 'frame')} of the {side} side" for side, count in imported.frames.items()]
-    sentence = f"{args.out}: {', '.join(counts)}, {counted(imported.torques, 'torque')}."
+    torques = counted(imported.torques, "torque")
+    if imported.torque_range_nm is not None:
+        low_nm, high_nm = imported.torque_range_nm
+        torques += f" from {low_nm:.3g} to {high_nm:.3g} N·m"
+    sentence = f"{args.out}: {', '.join(counts)}, {torques}."
     return print_result({"path": str(args.out), **asdict(imported)}, [sentence, *imported.remarks], as_json=args.json)

@@ -58,8 +58,12 @@ def find_grips(series: FrameSeries) -> list[Grip]:
         sides = f"the side {series.sides[0]}" if len(series.sides) == 1 else f"{' and '.join(series.sides)} together"
         raise CalibrationError(f"the recording holds no frames of {sides}; record some frames")
     if not np.isfinite(known).any():
-        others = f", and left out: {'; '.join(series.left_out)}" if series.left_out else ""
-        raise CalibrationError(f"no torque is known for these frames{others}; record the load cell with them")
+        if series.left_out:
+            raise CalibrationError(
+                f"no torque is known for these frames, and left out: {'; '.join(series.left_out)}; "
+                "record again with a load cell that measures"
+            )
+        raise CalibrationError("no torque is known for these frames; record the load cell with them")
     torque = np.abs(np.nan_to_num(known))
     is_loaded = torque > LOADED_FRACTION * torque.max(initial=np.finfo(np.float64).tiny)
     loaded = np.flatnonzero(is_loaded)

@@ -13,8 +13,6 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 LEVEL, TWO_SIDED_95 = 0.95, 1.96
 # Metadata of a dataclass's field: in the calibration's file its fields join the other fields of the dataclass.
 INLINE = {"inline": True}
-# Load cells on a lever bear some N·m; larger readings come from a damaged line.
-LARGEST_TORQUE_NM = 20.0
 # A measured tool is another one if its diameter differs by a larger fraction of the known diameter.
 _LARGEST_TOOL_FRACTION = 0.15
 # Recorded loads change by up to 0.76 N·m/s, so that nothing is known between readings further apart. One reading of a

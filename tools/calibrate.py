@@ -53,6 +53,11 @@ class CalibrationResult:
         return None if self.calibration.torque is None else self.calibration.torque.regressor
 
     @property
+    def all_frames(self) -> int:
+        """The frames of the parts, also those without a known torque or diameter."""
+        return sum(len(part.t_s) for part in self.parts)
+
+    @property
     def tool_mm(self) -> float | None:
         """The diameter of the only tool in the recordings, None where it is not known."""
         return None if math.isnan(self.calibration.tool_mm) else self.calibration.tool_mm
@@ -70,6 +75,7 @@ class CalibrationResult:
             "estimator": calibration.estimator.name,
             "quantities": list(calibration.outputs),
             "frames": self.frames,
+            "all_frames": self.all_frames,
             "sides": list(calibration.sides),
             "source": calibration.source,
             "assumptions": list(calibration.assumptions),

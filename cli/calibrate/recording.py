@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from shearloop.tools.estimate_tracks import EstimateTrack
     from shearloop.tools.leave_out import Plan
 
+# A calibration on a smaller fraction of the frames is doubted.
+_FEW_KNOWN = 0.5
 # The refits without each block may take about this long, estimated from the time of one fit.
 LEFT_OUT_WITHIN_S = 20.0
 
@@ -210,9 +212,14 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     calibration, regressor, timing = result.calibration, result.regressor, result.timing
     outputs, sides = " and ".join(calibration.outputs), " and ".join(calibration.sides)
     sentences = [
-        f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} frames of the {sides} side with a "
-        "known torque or diameter."
+        f"Estimator {calibration.estimator.name}, {outputs} from {result.frames} of {result.all_frames} frames of the "
+        f"{sides} side: those with a known torque or diameter."
     ]
+    if result.frames < _FEW_KNOWN * result.all_frames:
+        sentences.append(
+            f"Warning: only {result.frames / result.all_frames:.0%} of the frames have a known torque or diameter, so "
+            "it knows little of the others. Record again with a load cell that measures all the time."
+        )
     if regressor is not None and regressor.misses_loads:
         sentences.append(_misses_loads(regressor, calibration))
     if calibration.only_sign:

@@ -65,8 +65,8 @@ LARGEST_DIAMETER_MM = 140.0
 
 # Metadata key of a doubt about the load cell's times, and the doubt of an import.
 LOAD_DOUBT_NOTE = "load_doubt"
-# What an import corrected and left out, in sentences.
-REMARKS_NOTE = "remarks"
+# What an import corrected and left out, in sentences; and which load values it left out, in clauses.
+REMARKS_NOTE, LEFT_OUT_NOTE = "remarks", "left_out"
 LOAD_DOUBT = "the load's values waited in a buffer, and nothing shows for how long: its times may be seconds off"
 
 # The rooms that a replay runs.

@@ -193,7 +193,7 @@ def _reason(sample: LoadSample) -> str:
     flags = {
         "at the end of its range": sample.saturated,
         "further from the last one than the rig can move": sample.spike,
-        "the same for two seconds": sample.stuck,
+        "the same for two seconds (its board hangs, or prints too few digits)": sample.stuck,
         "perhaps the end of a longer line": sample.partial,
     }
     return "the reading is " + " and ".join(text for text, is_set in flags.items() if is_set)

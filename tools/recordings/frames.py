@@ -16,6 +16,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.before_frame import before_frame
+from shearloop.tools.recordings.load_values import STRAY, stray_values
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
 from shearloop.words import counted
 
@@ -170,6 +171,15 @@ def read_recording(path: str | Path) -> Recording:
     with reading(path):
         side_frames = {side: _side_frames(rows, found.moved[side]) for side, rows in found.frames.items()}
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
+    torque_t_ns = np.array([t_ns for t_ns, _ in found.torques], dtype=np.int64)
+    torque_nm = np.array([torque_nm for _, torque_nm in found.torques], dtype=np.float64)
+    is_stray = stray_values(torque_t_ns / 1e9, torque_nm)
+    left_out = list(found.left_out())
+    if is_stray.any():
+        readings = counted(len(is_stray), "reading")
+        left_out.insert(0, f"{np.count_nonzero(is_stray)} of {readings} of the load cell that {STRAY}")
+    if schema.LEFT_OUT_NOTE in notes:
+        left_out.insert(0, notes[schema.LEFT_OUT_NOTE])
     experiment = metadata.get(schema.EXPERIMENT_METADATA, {})
     if schema.DIAMETER_NOTE in experiment:
         notes[schema.DIAMETER_NOTE] = experiment[schema.DIAMETER_NOTE]
@@ -178,12 +188,12 @@ def read_recording(path: str | Path) -> Recording:
         source=notes.pop("source", ""),
         notes=notes,
         sides=side_frames,
-        torque_t_ns=np.array([t_ns for t_ns, _ in found.torques], dtype=np.int64),
-        torque_nm=np.array([torque_nm for _, torque_nm in found.torques], dtype=np.float64),
+        torque_t_ns=torque_t_ns[~is_stray],
+        torque_nm=torque_nm[~is_stray],
         tools=tuple(found.tools),
         table=table,
         live=live,
-        left_out=tuple(found.left_out()),
+        left_out=tuple(left_out),
         emulated=schema.EMULATED in identity,
         periods_s=periods_s,
     )

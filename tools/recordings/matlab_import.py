@@ -15,22 +15,22 @@ from shearloop.bank.matlab_file import MatFileError, Variable, read_variables
 from shearloop.daemon.recorder.schema import (
     DIAMETER_NOTE,
     LARGEST_DIAMETER_MM,
+    LEFT_OUT_NOTE,
     LOAD_DOUBT,
     LOAD_DOUBT_NOTE,
     REMARKS_NOTE,
     SIDES,
 )
 from shearloop.daemon.recorder.writer import new_recording
-from shearloop.drivers.defaults import FRAME_PERIOD_S, LOAD_CELL_RATE_HZ
+from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import ADC_REFERENCE_V
 from shearloop.drivers.frame_clock import slope_below
-from shearloop.drivers.load_cell import SLEW_NM_PER_S, STUCK_AFTER
-from shearloop.drivers.serial_sensor import StepFilter
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import measured_delay
-from shearloop.estimation.values import LARGEST_TORQUE_NM, longest_load_gap_s
+from shearloop.estimation.values import longest_load_gap_s
 from shearloop.files import open_file
+from shearloop.tools.recordings.load_values import rounding_step_nm, valid_load
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
 
@@ -50,10 +50,8 @@ _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _SHORTEST_FRAME_S = 0.05
 # Lines that were stamped late are fewer than this fraction.
 _MAX_LATE = 0.1
-# A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
+# A cable damages fewer values than this fraction.
 _MAX_DAMAGED = 0.1
-# Damaged values occur singly. This number in a row is a twist, in another unit.
-_MAX_IN_A_ROW = 4
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -73,6 +71,8 @@ _MIN_PACED, _PACED_S = 3, 0.03
 # their stamps, ± 0.27 s each, and 2.7 s by the gel's motion: one program, one delay. A loop with stamps
 # that differ by more than the second number comes from another program.
 _PROGRAM_LATE_S, _OTHER_PROGRAM_S = 2.7, 0.55
+# Rounding to a larger fraction of the largest torque costs accuracy.
+_COARSE_FRACTION = 0.02
 _HDF5_SIGNATURE = b"\x89HDF"
 
 
@@ -303,11 +303,12 @@ def _size(values: FloatArray) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ImportResult:
-    """The imported frames by side, the number of torques, and remarks in sentences."""
+    """The imported frames by side, the torques' number and range in N·m, and remarks in sentences."""
 
     frames: dict[str, int]
     torques: int
     remarks: tuple[str, ...]
+    torque_range_nm: tuple[float, float] | None = None
 
 
 def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -> ImportResult:
@@ -318,7 +319,7 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     times, for other times, for torques or voltages of another unit, and if there are no frames.
     """
     files = _mat_files(sources)
-    load, streams = _read_streams(files, time_format)
+    load, streams, load_path = _read_streams(files, time_format)
     remarks: list[str] = []
     if not TIME_FORMATS[time_format].has_date:
         remarks.append("The files name no date: their time 0 is 1970-01-02 00:00 UTC in the recording.")
@@ -330,7 +331,12 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
         for stream in streams.values():
             _check_whole(stream.unix_s)
         load, streams, sure = _loop_times(load, streams, remarks)
-    load = _valid_load(load, remarks)
+    valid, left_out = valid_load(load_path, load.unix_s, load.values[:, 0])
+    load = Stream(load.unix_s[valid], load.values[valid])
+    remarks += [f"Left out: {clause}." for clause in left_out]
+    if left_out:
+        notes[LEFT_OUT_NOTE] = "; ".join(left_out)
+    remarks += _rounded_load(load.values[:, 0])
     remarks += _missing_load(load.unix_s)
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in stream.unix_s] for side, stream in streams.items()}
     middles = {side: frame_middles(arrivals_ns) for side, arrivals_ns in arrivals.items()}
@@ -357,11 +363,16 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
         for t_s, torque in zip(load.unix_s, load.values[:, 0], strict=True):
             writer.add_torque(round(float(t_s) * 1e9), float(torque))
     counts = {side: len(stream.unix_s) for side, stream in streams.items()}
-    return ImportResult(counts, len(load.unix_s), tuple(remarks))
+    torques = load.values[:, 0]
+    span = (float(torques.min()), float(torques.max())) if len(torques) else None
+    return ImportResult(counts, len(torques), tuple(remarks), span)
 
 
-def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | None, dict[str, Stream]]:
-    """Return the load cell's stream, if any, and the fingertips' by side; raises UserError as `import_mat` does."""
+def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | None, dict[str, Stream], Path]:
+    """Return the load cell's stream, if any, the fingertips' by side, and the load's file (else the first one).
+
+    Raises UserError as `import_mat` does.
+    """
     streams: dict[str, Stream] = {}
     paths: dict[str, Path] = {}
     for path in files:
@@ -385,9 +396,7 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
         raise UserError("the files hold no frames of a fingertip; name the files of the right or left side too")
     for side, stream in streams.items():
         _check_volts(paths[side], stream.values)
-    if load is not None:
-        _check_torques(paths["load"], load.values[:, 0])
-    return load, streams
+    return load, streams, paths.get("load", files[0])
 
 
 def _check_volts(path: Path, lines: FloatArray) -> None:
@@ -397,18 +406,6 @@ def _check_volts(path: Path, lines: FloatArray) -> None:
         raise UserError(
             f"{path}: {beyond / lines.size:.0%} of the values are not within 0 to {ADC_REFERENCE_V:g} V, the range of "
             "the board's converter; write them in volts"
-        )
-
-
-def _check_torques(path: Path, torques: FloatArray) -> None:
-    """Raise UserError where more torques (n,) in N·m are too large than a cable damages: they have another unit."""
-    is_beyond = np.abs(torques) > LARGEST_TORQUE_NM
-    beyond = int(np.count_nonzero(is_beyond))
-    in_a_row = max((len(list(run)) for large, run in itertools.groupby(is_beyond) if large), default=0)
-    if beyond > max(2, _MAX_DAMAGED * len(torques)) or in_a_row > _MAX_IN_A_ROW:
-        raise UserError(
-            f"{path}: {beyond} of {counted(len(torques), 'load value')} are beyond {LARGEST_TORQUE_NM:g} N·m, so they "
-            "have another unit; write them in N·m"
         )
 
 
@@ -494,6 +491,17 @@ def _missing_load(stamps_s: FloatArray) -> Iterator[str]:
         )
 
 
+def _rounded_load(torque_nm: FloatArray) -> Iterator[str]:
+    """Yield the remark on torques (n,) in N·m that are rounded coarsely, where they are."""
+    step_nm = rounding_step_nm(torque_nm)
+    largest_nm = float(np.abs(torque_nm).max(initial=0.0))
+    if step_nm > _COARSE_FRACTION * largest_nm:
+        yield (
+            f"The load values are rounded to {step_nm:.2g} N·m, and the largest is {largest_nm:.2g} N·m: print more "
+            "digits in the load cell's sketch."
+        )
+
+
 def _loop_clock(stamps_s: FloatArray) -> tuple[float, float] | None:
     """Return when a loop's lines were sent: the first load after the first stamp, and frames after theirs, in s.
 
@@ -543,46 +551,6 @@ def _series_of_side(side: str, stream: Stream, middles_ns: Sequence[int], load: 
     t_s = np.array(middles_ns) / 1e9
     channels = PAPER_TABLE.channels_of_line(stream.values)[:, None]
     return FrameSeries((side,), t_s, channels, load.unix_s, load.values[:, 0], np.full(len(t_s), np.nan))
-
-
-def _valid_load(load: Stream, remarks: list[str]) -> Stream:
-    """Return the valid load values by rising time; appends to `remarks`."""
-    torque_nm = load.values[:, 0]
-    valid = np.abs(torque_nm) <= LARGEST_TORQUE_NM
-    if not valid.all():
-        remarks.append(
-            f"{counted(int(np.count_nonzero(~valid)), 'damaged load value')} beyond {LARGEST_TORQUE_NM:g} N·m left out."
-        )
-    # A stream that is faster than the cell repeats each of its values. The daemon counts alike.
-    period_s = float(np.median(np.diff(np.sort(load.unix_s)))) if len(load.unix_s) > 1 else 0.0
-    in_time = round(STUCK_AFTER / (period_s * LOAD_CELL_RATE_HZ)) if period_s > 0.0 else 0
-    stuck_after = max(STUCK_AFTER, in_time)
-    repeats = [len(list(run)) for _, run in itertools.groupby(torque_nm.tolist())]
-    stuck = np.repeat(np.array(repeats) >= stuck_after, repeats)
-    if stuck.any():
-        left_out = counted(int(np.count_nonzero(stuck)), "load value")
-        remarks.append(f"{left_out} left out that stood {stuck_after} times or more in a row: no load cell does that.")
-        valid &= ~stuck
-    order = np.flatnonzero(valid)[np.argsort(load.unix_s[valid], kind="stable")]
-    spikes = np.array(_spikes(load.unix_s[order], torque_nm[order], period_s), dtype=np.bool_)
-    if spikes.any():
-        left_out = counted(int(np.count_nonzero(spikes)), "load value")
-        remarks.append(f"{left_out} left out that jump by more than {SLEW_NM_PER_S:g} N·m/s: spikes of a damaged line.")
-        order = order[~spikes]
-    return Stream(load.unix_s[order], load.values[order])
-
-
-def _spikes(unix_s: FloatArray, torque_nm: FloatArray, period_s: float) -> list[bool]:
-    """Return which values (n,) by rising time are spikes, as the daemon judges them."""
-    levels = StepFilter[tuple[float, float]]()
-
-    def is_reachable(before: tuple[float, float], after: tuple[float, float]) -> bool:
-        (before_s, before_nm), (after_s, after_nm) = before, after
-        # A stream that is faster than the cell shows a change between two measurements in one step.
-        elapsed_s = max(after_s - before_s, period_s, 1.0 / LOAD_CELL_RATE_HZ)
-        return abs(after_nm - before_nm) <= SLEW_NM_PER_S * elapsed_s
-
-    return [levels.is_spike(value, is_reachable) for value in zip(unix_s.tolist(), torque_nm.tolist(), strict=True)]
 
 
 def _is_one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:

@@ -464,7 +464,8 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path, ran)
     found = read_recording(tmp_path / "a.mcap")
     assert imported.torques == len(found.torque_nm) == 353
     assert np.abs(found.torque_nm).max() < 0.06
-    assert "2 damaged load values beyond 20 N·m" in imported.remarks[0]
+    assert "Left out: 2 of 355 load values beyond 1.75 N·m, which a damaged line sends" in imported.remarks[0]
+    assert imported.torque_range_nm == (found.torque_nm.min(), found.torque_nm.max())
     assert f"  import   {imported.remarks[0]}" in ran("recording", "info", tmp_path / "a.mcap").out
 
 
@@ -477,7 +478,36 @@ def test_values_of_a_load_cell_that_stands_still_are_left_out(mat_folder, tmp_pa
     savemat(folder / "load.mat", {"Load_Data": load})
     imported = import_mat([folder], tmp_path / "a.mcap")
     assert imported.torques == 355 - 50
-    assert "50 load values left out that stood 20 times or more in a row" in imported.remarks[0]
+    assert "Left out: 50 of 355 load values that stood 20 times or more in a row" in imported.remarks[0]
+
+
+@pytest.mark.parametrize("step_nm", [1e-4, 5e-4, 1e-3, 5e-3, 0.02])
+def test_rounded_load_values_that_repeat_are_kept_and_those_of_a_line_that_hung_are_not(step_nm, mat_folder, tmp_path):
+    """A sketch that prints few digits repeats a value while the load rests or moves slowly."""
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    seconds = np.arange(0, 33, 0.03)[: len(load)]
+    noise = np.random.default_rng(0).normal(0, 1.4e-5, len(load))
+    torque = np.where(seconds > 3, 0.04 * (1 - np.cos(1.5 * (seconds - 3))), 0.0) + noise
+    load[:, 1] = np.round(torque / step_nm) * step_nm
+    savemat(folder / "load.mat", {"Load_Data": load})
+    assert import_mat([folder], tmp_path / "a.mcap").torques == 355
+    # From no load to the largest one.
+    load[130:172, 1] = load[130, 1] = 0.0
+    savemat(folder / "load.mat", {"Load_Data": load})
+    hung = import_mat([folder], tmp_path / "b.mcap")
+    assert "Left out: 42 of 355 load values that stood 20 times or more in a row" in hung.remarks[0]
+
+
+def test_what_an_import_left_out_of_the_load_is_said_where_it_is_missed(mat_folder, tmp_path, mistake):
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[:, 1] = 0.05
+    savemat(folder / "load.mat", {"Load_Data": load})
+    import_mat([folder], tmp_path / "a.mcap")
+    said = mistake("calibrate", tmp_path / "a.mcap", "--out", tmp_path / "a.cal")
+    assert "no torque is known for these frames, and left out: 355 of 355 load values that are all 0.05 N·m" in said
+    assert "record the load cell with them" not in said
 
 
 def test_a_load_that_is_written_faster_than_its_cell_measures_is_kept(mat_folder, tmp_path):
@@ -495,7 +525,7 @@ def test_a_load_that_is_written_faster_than_its_cell_measures_is_kept(mat_folder
 def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
     folder = mat_folder(glitches=range(0, 353, 5))
     with pytest.raises(
-        UserError, match=r"load\.mat: 71 of 355 load values are beyond 20 N·m, so they have another unit"
+        UserError, match=r"load\.mat: 71 of 355 load values are beyond 1\.75 N·m, .*they have another unit"
     ):
         import_mat([folder], tmp_path / "a.mcap")
     assert not list(tmp_path.glob("a.mcap*"))
@@ -503,8 +533,48 @@ def test_torques_of_another_unit_are_refused(mat_folder, tmp_path):
 
 def test_a_twist_in_another_unit_is_no_damage(mat_folder, tmp_path):
     """Most values of a recording without a load are small in any unit."""
-    with pytest.raises(UserError, match=r"5 of 355 load values are beyond 20 N·m, so they have another unit"):
+    with pytest.raises(UserError, match=r"5 of 355 load values are beyond 1\.75 N·m, .*another unit"):
         import_mat([mat_folder(glitches=range(100, 105))], tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize(("factor", "cause"), [(100, r"are beyond 1\.75 N·m, the capacity"), (20, "jump by more than")])
+def test_a_unit_that_the_rig_cannot_reach_is_refused(factor, cause, mat_folder, tmp_path):
+    """N·cm is no damage: many values are too large, or the load jumps again and again and stays there."""
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[:, 1] *= factor
+    savemat(folder / "load.mat", {"Load_Data": load})
+    with pytest.raises(UserError, match=rf"load\.mat: \d+ of 355 load values {cause}.*another unit"):
+        import_mat([folder], tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("width", [1, 2])
+@pytest.mark.parametrize("spike_nm", [0.13, 0.0])
+def test_values_that_leave_their_neighbours_and_come_back_are_left_out(spike_nm, width, mat_folder, tmp_path):
+    """Below 2 N·m/s, so that a slipping tool could do it; but it would not come back at once."""
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[:, 1] = 0.05 + 0.02 * np.sin(0.1 * np.arange(355))
+    for at in (20, 100, 300):
+        load[at : at + width, 1] = spike_nm
+    savemat(folder / "load.mat", {"Load_Data": load})
+    imported = import_mat([folder], tmp_path / "a.mcap")
+    assert f"Left out: {3 * width} of 355 load values that leave the values around them" in imported.remarks[0]
+    found = read_recording(tmp_path / "a.mcap")
+    assert found.torque_nm.min() > 0.025
+    assert found.torque_nm.max() < 0.075
+
+
+def test_readings_of_a_daemon_that_come_back_at_once_are_not_used(tmp_path):
+    """The daemon cannot wait for the next readings, which show it."""
+    with new_recording(tmp_path / "a.mcap", "a daemon") as file:
+        file.add_frame("right", 10**18, 10**18 + 10**8, np.ones(1024))
+        for n in range(100):
+            file.add_torque(10**18 + n * 91_600_000, 0.15 if n == 50 else 0.01 + 1e-5 * (n % 3))
+    found = read_recording(tmp_path / "a.mcap")
+    assert len(found.torque_nm) == 99
+    assert found.torque_nm.max() < 0.02
+    assert "1 of 100 readings of the load cell that leave the values around them" in found.left_out[0]
 
 
 @pytest.mark.parametrize("factor", [1000, -1])

@@ -155,7 +155,12 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
 
 @pytest.mark.parametrize(
     ("flag", "why"),
-    [("saturated", "end of its range"), ("spike", "can move"), ("stuck", "two seconds"), ("partial", "longer line")],
+    [
+        ("saturated", "end of its range"),
+        ("spike", "can move"),
+        ("stuck", "two seconds (its board hangs, or prints too few digits)"),
+        ("partial", "longer line"),
+    ],
 )
 async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag, why):
     async with reading() as (_, board):

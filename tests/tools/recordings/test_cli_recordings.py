@@ -382,3 +382,15 @@ def test_the_picture_of_a_stream_shows_torque_also_with_a_named_tool(kind, draw,
     assert ("<!-- no load on a load cell" in picture) == (estimated_nm == 0)
     judged = f"one; 4 loaded frames: RMSE {0.1 - estimated_nm:g} N·m (always saying 0: 0.1)"
     assert (f"<!-- {judged} -->" in picture) == (kind is FrameSeries)
+
+
+def test_calibrate_says_that_most_frames_have_no_known_torque():
+    ramp, t = np.linspace(0.0, 1.0, 20), np.arange(50.0)
+    part = FrameSeries(("right",), t, np.zeros((50, 1, 896)), t, np.zeros(50), np.full(50, np.nan))
+    model = OutputModel(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), np.zeros(0))
+    calibration = Calibration(Regression(np.ones((1, 896))), ("right",), "ramp", "", torque=model)
+    few = CalibrationResult(calibration, 3, parts=[part])
+    assert "from 3 of 50 frames of the right side" in sentences_of(few)[0]
+    assert sentences_of(few)[1].startswith("Warning: only 6% of the frames have a known torque or diameter")
+    assert few.figures()["all_frames"] == 50
+    assert "only" not in " ".join(sentences_of(replace(few, frames=40))[:2])

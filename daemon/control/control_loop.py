@@ -145,7 +145,6 @@ class ControlLoop:
         self._zero_known: dict[str, bool] = {}
         # Faults that were reported since the latest tick.
         self._reported: list[Fault] = []
-        self._ticked_ns = 0
         self.operator = OperatorView(
             self.inputs,
             self.tool,
@@ -271,7 +270,7 @@ class ControlLoop:
         """
         if (reason := self.operator.start_refusal()) is not None:
             return reason
-        found = detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self._ticked_ns)
+        found = detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self.inputs.ticked_ns)
         of_any = [fault for fault in self._lasting(found) if fault.code is not FaultCode.TORQUE_LIMIT]
         return _refusal_by(of_any) or self._awaited_judgement()
 
@@ -347,7 +346,7 @@ class ControlLoop:
         if sent_rad_per_s is not None:
             self.wrist.sent(sent_rad_per_s)
         running, arm = self.running_experiment, self.inputs.arm
-        self.inputs.late_s, self._ticked_ns = late_s, t_ns
+        self.inputs.late_s, self.inputs.ticked_ns = late_s, t_ns
         limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
         awaited = self._awaited_torques(t_ns)
         step = self._running_step(running, awaited) if running is not None else None

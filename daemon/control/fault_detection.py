@@ -148,7 +148,7 @@ def _torque_faults(inputs: LatestInputs, watched: Watched, step: RunningStep, t_
     driving, robot_is_silent = watched.driving, _is_silent(inputs.arm, watched.patience, t_ns)
     # A torque that comes with the robot's state is silent with it, which is a fault of its own.
     judged = [one for one in (*watched.supervising, driving) if not (one.from_robot and robot_is_silent)]
-    unusable = {one.name: fault for one in judged if (fault := _unusable(inputs, one, t_ns)) is not None}
+    unusable = {one.name: fault for one in judged if (fault := source_fault(inputs, one, t_ns)) is not None}
     found = [*unusable.values()]
     if step.lacks_zero:
         lost = f"{driving.name} was disconnected, or its zero was not taken, so its torques may be off by any load"
@@ -181,7 +181,7 @@ def _is_silent(arm: ArmStatus | None, patience: float, t_ns: int) -> bool:
     return arm is None or t_ns - arm.t_ns > patience * ARM_STALE_S * 1e9
 
 
-def _unusable(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | None:
+def source_fault(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault | None:
     """Return the fault of a source that is gone, silent, late or invalid."""
     latest = inputs.torques.get(source.name)
     if source.name in inputs.lost:

@@ -93,7 +93,8 @@ class LatestInputs:
     gripper: GripperStatus | None = None
     lost: dict[str, str] = field(default_factory=dict)
     recording_error: str = ""
-    # How late the loop is, and the error of each dead task.
+    # When the loop decided last, how late it was, and the error of each dead task.
+    ticked_ns: int = 0
     late_s: float = 0.0
     died: Mapping[str, str] = field(default_factory=dict)
 

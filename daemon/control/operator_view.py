@@ -9,12 +9,15 @@ from dataclasses import dataclass
 
 from shearloop.daemon.control.experiment import Experiment
 from shearloop.daemon.control.experiment_schema import ApproachStep, ExperimentFile
+from shearloop.daemon.control.fault_detection import source_fault
+from shearloop.daemon.control.faults import FaultCode
 from shearloop.daemon.control.held_tool import GRIPPED_BEFORE, HeldTool
 from shearloop.daemon.control.inputs import LatestInputs
 from shearloop.daemon.control.known_tool import UNTURNED_RAD, KnownTool, known_at_start
 from shearloop.daemon.control.safety import SafetyMonitor
 from shearloop.daemon.control.step_motions import (
     first_grip,
+    first_measured,
     first_motion_before_grip,
     first_release,
     first_turn_before_tare,
@@ -157,9 +160,10 @@ class OperatorView:
         return f"step {number} (release) opens the gripper, and a tool in it drops; {what}"
 
     def why_not_with_tool(self, file: ExperimentFile) -> str | None:
-        """Return why a tool in the gripper, or an unknown zero of the torque, forbids an experiment, or None."""
+        """Return why a tool in the gripper, a silent sensor or an unknown zero forbids an experiment, or None."""
         driving = self.sources[file.torque_source]
-        if reason := self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_zero(file, driving):
+        reason = self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_sensor(file)
+        if reason := reason or self._why_no_zero(file, driving):
             return reason
         number, uncertain = first_motion_before_grip(file), self.tool.uncertain
         if number is None:
@@ -205,6 +209,18 @@ class OperatorView:
             f"{held}; step {number} (grip) to {step.width_mm:g} mm would open them and drop it: put a `release` before "
             "it, or correct `width_mm`"
         )
+
+    def _why_no_sensor(self, file: ExperimentFile) -> str | None:
+        """Return which sensors are gone or silent, if a step needs them, or None; as they were at the latest tick.
+
+        A torque that is not valid refuses nothing: it may be valid once a tool is gripped.
+        """
+        if first_measured(file, holds=self.tool.may_hold()) is None:
+            return None
+        sensors = (source for source in self.sources.values() if not source.from_robot)
+        faults = (source_fault(self.inputs, sensor, self.inputs.ticked_ns) for sensor in sensors)
+        missing = (fault for fault in faults if fault is not None and fault.code is not FaultCode.ESTIMATE_INVALID)
+        return " ".join(fault.sentence for fault in missing) or None
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""

@@ -4,6 +4,7 @@ import math
 from typing import Final, NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
+    AdaptStep,
     ApproachStep,
     ExperimentFile,
     GripperStep,
@@ -36,16 +37,20 @@ def first_motion_before_grip(file: ExperimentFile) -> int | None:
 
 
 def first_turn_before_tare(file: ExperimentFile, *, holds: bool = False) -> int | None:
-    """Return the number, from 1, of the first step that turns a tool before any tare, or None.
+    """Return the number, from 1, of the first step that turns a tool before any tare, or None; `holds` as below."""
+    number = first_measured(file, holds=holds)
+    return None if number is None or isinstance(file.steps[number - 1], TareStep) else number
 
-    `holds`: whether the gripper may hold one as the experiment begins.
+
+def first_measured(file: ExperimentFile, *, holds: bool) -> int | None:
+    """Return the number, from 1, of the first step that needs the sensors, or None: it turns a tool, tares or adapts.
+
+    `holds`: whether the gripper may hold a tool as the experiment begins.
     """
     for number, step in enumerate(file.steps, 1):
-        if isinstance(step, TareStep):
-            return None
         if isinstance(step, GripperStep):
             holds = not isinstance(step, ReleaseStep)
-        if isinstance(step, TwistingStep) or (holds and isinstance(step, TurnToStep)):
+        if isinstance(step, AdaptStep | TareStep | TwistingStep) or (holds and isinstance(step, TurnToStep)):
             return number
     return None
 

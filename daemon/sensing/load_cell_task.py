@@ -117,6 +117,9 @@ class LoadCellTask:
         # A reading from before says nothing of the time since.
         if latest is not None and latest.t_mid_ns >= zero.from_ns:
             reason = _reason(latest)
+        board = self._board.diagnostics()
+        if not board["connected"]:
+            reason = str(board["last_loss"]).removesuffix(".")
         reason = reason or "no usable reading came"
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 

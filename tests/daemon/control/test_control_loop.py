@@ -109,6 +109,41 @@ def test_a_tool_that_slips_while_a_torque_is_held_ends_in_a_stop_and_not_as_done
     assert rig.true_nm[-1] < 0.05
 
 
+MISSING = "There is no serial port /dev/load; no USB serial port is plugged in."
+
+
+@pytest.mark.parametrize("gone", ["right", "load_cell"])
+@pytest.mark.parametrize("drive", ["right", "load_cell"])
+@pytest.mark.parametrize("how", ["unplugged", "silent", "never there"])
+def test_a_sensor_that_is_gone_or_silent_refuses_what_needs_torques_before_anything_moves(how, drive, gone):
+    """The start was accepted, the fingers closed, and the wrist was held at its first turn; a `tare` took 15 s."""
+    loop = ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("gripper",))
+    rig = Rig(loop)
+    if how == "never there":
+        rig.silent.add(gone)
+    rig.run(2)
+    rig.silent.add(gone)
+    if how == "unplugged":
+        loop.on_link(gone, MISSING, up=False)
+    rig.run(2)
+    cause = {
+        "unplugged": f"a sensor is not connected: {gone} is gone: {MISSING[:-1]}. Connect it again",
+        "silent": f"a sensor has sent nothing new: the last torque of {gone} came 2.",
+        "never there": f"a sensor has sent nothing new: {gone} has not measured anything yet. Check the sensor's cable",
+    }[how]
+    for step in ({"do": "tare"}, {"do": "identify"}, {"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 1}):
+        if step["do"] == "tighten":
+            step["direction"] = "clockwise"
+        needing = ExperimentFile.model_validate({"name": "test", "steps": [GRIP, step], "torque_source": drive})
+        refusal = loop.start(needing, rig.t_ns)
+        assert (refusal or "").startswith(cause), step["do"]
+        assert file_refusal(loop.operator, needing) == refusal
+    adapts = {"do": "adapt", "fingertip": "right", "reference": "load_cell"}
+    assert file_refusal(loop.operator, ExperimentFile.model_validate({"name": "test", "steps": [adapts]}))
+    steps = [GRIP, {"do": "wait", "wait_s": 1}, {"do": "release"}]
+    assert loop.start(ExperimentFile(name="test", steps=steps, torque_source=drive), rig.t_ns) is None
+
+
 def pause_for(rig: Rig, seconds: float) -> None:
     assert rig.control_loop.pause() is None
     rig.run(seconds)

@@ -109,6 +109,14 @@ async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypat
         assert board.tares == [], "nor at whatever load comes later"
 
 
+async def test_a_zero_of_a_board_that_is_gone_says_why_it_is_gone():
+    async with reading() as (task, board):
+        gone = {"connected": False, "last_loss": "There is no serial port /dev/load.", "last_refusal": ""}
+        board.diagnostics = lambda: gone
+        why = await task.tare_and_wait(0.01)
+        assert why == "the load cell's zero could not be taken within 0.01 s: There is no serial port /dev/load"
+
+
 async def test_the_operators_tare_is_taken_from_the_next_samples():
     async with reading() as (task, board):
         task.tare()

@@ -39,7 +39,8 @@ from shearloop.drivers.hosts import is_loopback_host, one_spelling
 from shearloop.drivers.robotiq.gripper import RobotiqClient, RobotiqGripper
 from shearloop.drivers.robotiq.socket_client import REPLY_DEADLINE_S, SocketClient
 from shearloop.drivers.robotiq.widths import WidthCalibration
-from shearloop.drivers.ur.client import UrRobot, missing_library
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.library import missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import Hint, UserError
 

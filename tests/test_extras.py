@@ -4,8 +4,7 @@ import re
 
 import pytest
 
-from shearloop.drivers.ur import script
-from shearloop.drivers.ur.client import missing_library
+from shearloop.drivers.ur.library import missing_library, why_other_client
 from shearloop.extras import missing
 
 
@@ -15,7 +14,7 @@ def python_in_a_folder_with_a_blank(monkeypatch):
 
 
 def test_the_command_that_installs_a_library_can_be_copied(monkeypatch):
-    monkeypatch.setattr("shearloop.drivers.ur.script.version", lambda _name: "1.7.0")
-    monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
-    for said in (str(missing("matplotlib", "plot", "a chart")), script.why_other_client(), missing_library()):
+    monkeypatch.setattr("shearloop.drivers.ur.library.version", lambda _name: "1.7.0")
+    monkeypatch.setattr("shearloop.drivers.ur.library.find_spec", lambda _name: None)
+    for said in (str(missing("matplotlib", "plot", "a chart")), why_other_client(), missing_library()):
         assert re.search(r"'/home/ada/my env/bin/python' -m pip install \S", said)

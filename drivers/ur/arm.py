@@ -17,6 +17,7 @@ from statistics import fmean
 import rtde_control
 
 from shearloop.drivers.ur.dashboard import command_dashboard
+from shearloop.drivers.ur.library import why_other_client
 from shearloop.drivers.ur.messages import (
     RUNTIME_PLAYING,
     ControllerError,
@@ -30,7 +31,7 @@ from shearloop.drivers.ur.primary_port import PrimaryPort
 from shearloop.drivers.ur.receiver import RtdeReceiver
 from shearloop.drivers.ur.rtde import has_other_client
 from shearloop.drivers.ur.sample_age import SampleAge
-from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, ScriptRegisters, control_program, why_other_client
+from shearloop.drivers.ur.script import NO_MOTION_TICKS, UPPER, ScriptRegisters, control_program
 from shearloop.drivers.ur.script_port import ScriptPort
 from shearloop.drivers.ur.script_readiness import ScriptReadiness
 from shearloop.drivers.ur.settings import Six, UrSettings

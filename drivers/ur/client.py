@@ -6,23 +6,18 @@ A new worker has motion disabled. No command is sent twice, and nothing moves be
 import asyncio
 import contextlib
 import math
-import platform
-import shlex
 import signal
 import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any, TypeAlias, cast
 
 from shearloop.drivers.connection import Diagnostics, LinkMonitor
 from shearloop.drivers.errors import ProtocolError
 from shearloop.drivers.ur import messages
 from shearloop.drivers.ur.messages import RobotLostError
-from shearloop.drivers.ur.script import CLIENT_VERSION, why_other_client
 from shearloop.drivers.ur.settings import ENOUGH_STATES, Six, UrSettings
 from shearloop.timeouts import timeout
 
@@ -43,23 +38,6 @@ LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
 # Interval of the checks for a silent worker.
 WATCH_S = 0.1
 _SECOND_NS = 10**9
-
-
-def missing_library() -> str:
-    """Return why the robot cannot be driven with this Python, or an empty string."""
-    pip = f"{shlex.quote(sys.executable)} -m pip install"
-    if find_spec("rtde_control") is None:
-        return (
-            f"the robot needs the package ur-rtde, which is not installed for Python {platform.python_version()} on "
-            f"{platform.machine()}: use Python 3.11 or 3.12 on x86-64, or build it with "
-            f"`{pip} ur-rtde=={CLIENT_VERSION}`, which needs cmake, g++, git and Boost's headers"
-        )
-    try:
-        import_module("rtde_control")
-    except ImportError as error:
-        again = f"`{pip} --force-reinstall --no-deps ur-rtde=={CLIENT_VERSION}`"
-        return f"the package ur-rtde, which drives the robot, cannot be loaded: install it again with {again} ({error})"
-    return why_other_client()
 
 
 class UrRobot:

@@ -9,19 +9,13 @@ is slower than these stops, because a program that ends while the arm moves may 
 
 import hashlib
 import math
-import shlex
-import sys
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
 from shearloop.drivers.ur.settings import GENERATIONS, MOVE_GRACE_S, GenerationFacts, Six, UrSettings
-
-# The script uses the protocol of this version of ur-rtde only.
-CLIENT_VERSION: Final = "1.6.5"
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,20 +109,6 @@ _FROM_SETTINGS: Final[Mapping[str, Callable[[UrSettings], float]]] = {
 }
 # Replaces each value of a rig in the hashed text.
 _NO_VALUE: Final = "?"
-
-
-def why_other_client() -> str:
-    """Return why the installed ur-rtde cannot drive our script, or an empty string."""
-    try:
-        found = version("ur-rtde")
-    except PackageNotFoundError:
-        found = "unknown"
-    if found == CLIENT_VERSION:
-        return ""
-    return (
-        f"the installed ur-rtde is of version {found}, and the script for the robot speaks only the protocol of "
-        f"{CLIENT_VERSION}: install it with `{shlex.quote(sys.executable)} -m pip install ur-rtde=={CLIENT_VERSION}`"
-    )
 
 
 def own_script_hash() -> str:

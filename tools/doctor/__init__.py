@@ -19,7 +19,7 @@ from shearloop.daemon.report_in_use import commissioning_of
 from shearloop.daemon.rig import configured_settings, gripper_elsewhere
 from shearloop.daemon.running_rig import EMULATED
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.client import missing_library
+from shearloop.drivers.ur.library import missing_library
 from shearloop.errors import UserError
 from shearloop.tools.check import OPEN_KEYS, CheckEmulators, check_parts, why_not_recorded
 from shearloop.tools.doctor.devices import (

@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from shearloop.drivers.ur import receiver, script
+from shearloop.drivers.ur import library, receiver
 from shearloop.drivers.ur import settings as ur
 from shearloop.drivers.ur.messages import MoveLinear, RobotLostError, RtdeOutputs, WristSpeed
 from shearloop.drivers.ur.script import LOWER, NO_MOTION_TICKS, UPPER
@@ -75,7 +75,7 @@ def arm(monkeypatch) -> Iterator[ModuleType]:
     # It is the default of an argument, so that it has to be there at the import.
     monkeypatch.setattr(receiver, "RtdeReceiver", Receiver)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
-    monkeypatch.setattr(script, "version", lambda _: script.CLIENT_VERSION)
+    monkeypatch.setattr(library, "version", lambda _: library.CLIENT_VERSION)
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
@@ -163,7 +163,7 @@ def test_sent_script_arms_its_watchdog(arm, monkeypatch):
 @pytest.mark.parametrize("found", ["1.6.4", "1.7.0"])
 def test_another_version_of_the_client_is_refused_by_name(arm, monkeypatch, found):
     """Its commands may have other numbers."""
-    monkeypatch.setattr(script, "version", lambda _: found)
+    monkeypatch.setattr(library, "version", lambda _: found)
     with pytest.raises(RobotLostError, match=rf"is of version {found}, .* ur-rtde==1.6.5") as lost:
         arm.UrArm(SETTINGS)
     assert lost.value.kind == "version"
@@ -173,7 +173,7 @@ def test_a_client_without_a_version_is_refused(arm, monkeypatch):
     def missing(name: str) -> str:
         raise PackageNotFoundError(name)
 
-    monkeypatch.setattr(script, "version", missing)
+    monkeypatch.setattr(library, "version", missing)
     with pytest.raises(RobotLostError, match="is of version unknown"):
         arm.UrArm(SETTINGS)
 

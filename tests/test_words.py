@@ -1,6 +1,6 @@
 import pytest
 
-from shearloop.words import counted, times
+from shearloop.words import CountedReasons, beyond, counted, times
 
 
 @pytest.mark.parametrize(("count", "shown"), [(0, "0 frames"), (1, "1 frame"), (2, "2 frames")])
@@ -15,3 +15,21 @@ def test_a_noun_brings_its_verb():
 
 def test_a_few_times_have_a_word():
     assert [times(count) for count in (1, 2, 3)] == ["once", "twice", "3 times"]
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "sign", "text"),
+    [(0.34, 0.3, "", "0.34"), (0.31, 0.3, "", "0.31"), (6.0, 0.3, "", "6.0"), (-0.3004, 0.3, "+", "-0.3004")],
+)
+def test_a_value_beyond_a_limit_does_not_read_as_the_limit(value, limit, sign, text):
+    """It was "stood still for 0.3 s, and 0.3 s are allowed"."""
+    assert beyond(value, limit, 1, sign) == text
+
+
+def test_reasons_that_count_up_are_one_without_the_count():
+    """27 torques were "taking the idle frame, 10 of 10"."""
+    reasons = CountedReasons()
+    for number in range(1, 28):
+        reasons.add(f"taking the idle frame, {number} of 30")
+    reasons.add("no grip")
+    assert reasons.most_frequent_first == [(27, "taking the idle frame, … of 30"), (1, "no grip")]

@@ -16,6 +16,7 @@ from shearloop.daemon.control.known_tool import AT_REST, TORQUE_TOLERANCE, Known
 from shearloop.daemon.control.step_demands import demands
 from shearloop.daemon.control.step_motions import AS_ASKED, Speeds
 from shearloop.daemon.torques import SIGNS
+from shearloop.words import beyond
 
 # An angle counts as reached within this; the wrist's resolution is ten times finer.
 ANGLE_TOLERANCE_RAD = 0.002
@@ -183,7 +184,7 @@ class Experiment:
         longest_s, spent_s = self.step.timeout_s, self._elapsed_s - self._step_began_s
         if longest_s is not None and spent_s > longest_s:
             step = f"step {self.step_number} ({self.step.do})"
-            self.overdue = f"{step} has taken {spent_s:.1f} s of at most {longest_s:g} s"
+            self.overdue = f"{step} has taken {beyond(spent_s, longest_s, 1)} s of at most {longest_s:g} s"
 
     def begin_action(self) -> bool:
         """Return whether the command's action has to begin now; it counts as begun."""

@@ -11,6 +11,7 @@ from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInpu
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 from shearloop.daemon.torques import TorqueSample, TorqueSource
+from shearloop.words import beyond
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
@@ -113,16 +114,17 @@ def _torque_limit_faults(
         if grasp is Grasp.CHANGING and source.warm_up_s:
             continue
         if t_ns - torque.t_ns <= source.fresh_s * 1e9:
-            beyond = f"{source.name} measured {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
+            torque_nm = beyond(torque.torque_nm, limit_nm + source.noise_nm, 3, "+")
+            measured = f"{source.name} measured {torque_nm} N·m, the limit is {limit_nm:g} N·m"
             if source.noise_nm:
-                beyond += f" and its noise {source.noise_nm:g} N·m"
-            yield Fault(FaultCode.TORQUE_LIMIT, beyond, t_ns=torque.t_mid_ns)
+                measured += f" and its noise {source.noise_nm:g} N·m"
+            yield Fault(FaultCode.TORQUE_LIMIT, measured, t_ns=torque.t_mid_ns)
 
 
 def _angle_limit_fault(inputs: LatestInputs, watched: Watched, limit_rad: float, twisted_rad: float) -> Fault:
     clamped = "gripper" not in watched.required
     since = "its angle began to count" if clamped else "the grip"
-    turned = f"turned by {twisted_rad:+.3f} rad since {since}, the limit is {limit_rad:g} rad"
+    turned = f"turned by {beyond(twisted_rad, limit_rad, 3, '+')} rad since {since}, the limit is {limit_rad:g} rad"
     if clamped:
         turned += "; if another tool has been clamped, `shearloop command release --yes` lets it count from 0"
     return Fault(FaultCode.ANGLE_LIMIT, turned, t_ns=inputs.arm.t_ns if inputs.arm is not None else None)
@@ -132,7 +134,7 @@ def _lateness_faults(late_s: float, patience: float, t_ns: int) -> Iterator[Faul
     longest_hang_s, stood_s = patience * LONGEST_HANG_S, late_s + LONGEST_TICK_S
     decided_ns = t_ns - round(stood_s * 1e9)
     if stood_s > longest_hang_s:
-        stood = f"it stood still for {stood_s:.1f} s, and {longest_hang_s:g} s are allowed"
+        stood = f"it stood still for {beyond(stood_s, longest_hang_s, 1)} s, and {longest_hang_s:g} s are allowed"
         yield Fault(FaultCode.DAEMON_PAUSED, stood, t_ns=decided_ns)
     elif late_s > patience * LATEST_LOOP_S:
         yield Fault(FaultCode.LOOP_LATE, f"the loop ran {late_s * 1e3:.0f} ms late", t_ns=decided_ns)
@@ -201,7 +203,8 @@ def source_fault(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault
     if is_old and why_no_wrench:
         return Fault(FaultCode.WRENCH_UNKNOWN, why_no_wrench, t_ns=latest.t_ns)
     if came_s > source.fresh_s:
-        old = f"the last {what} of {source.name} came {came_s:.1f} s ago, {source.fresh_s:.1f} s are allowed"
+        ago_s = beyond(came_s, source.fresh_s, 1)
+        old = f"the last {what} of {source.name} came {ago_s} s ago, {source.fresh_s:.3g} s are allowed"
         return Fault(FaultCode.ESTIMATE_STALE, old, t_ns=latest.t_ns)
     if is_old:
         return Fault(FaultCode.ESTIMATE_STALE, _late(source, what, came_s, measured_s), t_ns=latest.t_mid_ns)
@@ -213,8 +216,8 @@ def source_fault(inputs: LatestInputs, source: TorqueSource, t_ns: int) -> Fault
 
 def _late(source: TorqueSource, what: str, came_s: float, measured_s: float) -> str:
     return (
-        f"the last {what} of {source.name} was measured {measured_s:.1f} s ago, {source.oldest_s:.1f} s are allowed; "
-        f"it took {measured_s - came_s:.1f} s to come"
+        f"the last {what} of {source.name} was measured {beyond(measured_s, source.oldest_s, 1)} s ago, "
+        f"{source.oldest_s:.3g} s are allowed; it took {measured_s - came_s:.1f} s to come"
     )
 
 
@@ -237,7 +240,7 @@ class _Comparison:
             return []
         apart = (
             f"{slow.name} measured {self.slow_nm:+.3f} N·m and {fast.name} {self.fast_nm:+.3f} N·m, "
-            f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed"
+            f"{beyond(apart_nm, allowed_nm, 3)} N·m apart where {allowed_nm:g} are allowed"
         )
         # A torque on another tool than the calibrated one may be off by any factor.
         latest = (inputs.torques.get(source.name) for source in (slow, fast))

@@ -11,6 +11,7 @@ from shearloop.daemon.control.torque_controller import WristLimit
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSource
 from shearloop.errors import UserError
+from shearloop.words import beyond
 
 # The grid of the torque's lag behind its stamp.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)
@@ -305,8 +306,9 @@ class StiffnessExcitation:
         # The mean of three: the noise of one must not end the step.
         mean = fmean(latest_nm for *_, latest_nm in self._torques[-3:])
         if abs(mean) > self._settings.torque_limit_nm and len(self._torques) >= 3:
+            reached_nm = beyond(mean, self._settings.torque_limit_nm, 3)
             self.failure = (
-                f"identify: the torque has reached {mean:.3g} N·m and the limit of the step is "
+                f"identify: the torque has reached {reached_nm} N·m and the limit of the step is "
                 f"{self._settings.torque_limit_nm:g} N·m; turn less than {self._settings.amplitude_rad:g} rad"
             )
 

@@ -36,6 +36,7 @@ import numpy as np
 
 from shearloop.daemon.loop_config import LoopConfig
 from shearloop.daemon.torques import TorqueSample
+from shearloop.words import beyond
 
 # The ramp does not catch up when the loop was late for longer than this.
 LONGEST_STEP_NS = 50_000_000
@@ -230,7 +231,7 @@ class TorqueFilter:
         if not self.slipped:
             return ""
         moved_nm, limit_nm = self.offset_nm - self._reference_nm, self._settings.offset_limit_nm
-        return f"at one angle it moved by {moved_nm:+.3f} N·m, and {limit_nm:g} are allowed"
+        return f"at one angle it moved by {beyond(moved_nm, limit_nm, 3, '+')} N·m, and {limit_nm:g} are allowed"
 
     def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int, *, integrates: bool = True) -> bool:
         """Use a torque of the time t_mid_ns that arrived at t_ns; return whether it can be used.

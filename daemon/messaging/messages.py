@@ -363,6 +363,10 @@ def stop_times(loop_stop: Mapping[str, Any]) -> str:
 
     sent = f"sent {after('sent_after_s')}" if after("sent_after_s") else "no reply of the robot's worker"
     stands = f"standstill {after('stands_after_s')}" if after("stands_after_s") else "no standstill measured"
+    decided_s, stands_s = loop_stop.get("decided_after_s"), loop_stop.get("stands_after_s")
+    if decided_s is not None and stands_s is not None and stands_s < decided_s:
+        # By a hold, or by the robot's own deadline.
+        stands += ", before the decision"
     if loop_stop.get("refusal"):
         blocked = after("blocked_after_s")
         sent = f"not sent, because the robot was blocked {blocked}" if blocked else "refused by the robot's worker"

@@ -10,6 +10,7 @@ from shearloop.drivers.ur.messages import MoveLinear, RtdeOutputs, RtdeSample, W
 from shearloop.drivers.ur.poses import ONLY_TURNS_M, is_close, turn_between
 from shearloop.drivers.ur.settings import Bound, InstalledTool, Six, UrLimits, UrSettings
 from shearloop.errors import Hint
+from shearloop.words import beyond
 
 WRIST = 5
 # The longest stop, however gentle the command.
@@ -152,11 +153,13 @@ def position_beyond_limits(sample: RtdeOutputs, limits: UrLimits) -> Hint | None
     cure = "move the arm back with freedrive at the teach pendant, or correct `limits.{}` in the robot's settings"
     for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
         if not low <= q <= high:
-            cause = f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad"
+            at = beyond(q, low if q < low else high, 3)
+            cause = f"Joint {number} is at {at} rad, beyond its hard limits of {low:g} and {high:g} rad"
             return Hint(cause, cure.format("joints"))
     for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
-            cause = f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m"
+            at = beyond(value, low if value < low else high, 3)
+            cause = f"The tool is at {axis} = {at} m, beyond the workspace's {low:g} to {high:g} m"
             return Hint(cause, cure.format("workspace"))
     return None
 
@@ -223,7 +226,9 @@ def _beyond(name: str, value: float, bound: Bound, unit: str) -> str:
     # Rounding errors do not count.
     if round(value, 9) <= bound.hard:
         return ""
-    return f"{name.capitalize()} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+    return (
+        f"{name.capitalize()} is {beyond(value, bound.hard, 2)} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
+    )
 
 
 def line_violation(sample: RtdeSample, limits: UrLimits) -> str:
@@ -272,7 +277,8 @@ def _fading(sample: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
     for name, value, bound, unit in _loads(sample, limits):
         if value > bound.inner:
             share = max(0.0, (bound.hard - value) / (bound.hard - bound.inner))
-            found.append((share, f"{name} of {value:.2f} {unit} is above the inner limit of {bound.inner:g} {unit}"))
+            measured = beyond(value, bound.inner, 2)
+            found.append((share, f"{name} of {measured} {unit} is above the inner limit of {bound.inner:g} {unit}"))
     return found
 
 

@@ -13,6 +13,13 @@ def counted(count: int, one: str, many: str = "") -> str:
     return f"{count} {one if count == 1 else many or f'{one}s'}"
 
 
+def beyond(value: float, limit: float, decimals: int, sign: str = "") -> str:
+    """Return a value beyond a limit, with more decimals where the two would read the same."""
+    while decimals < 9 and round(abs(value), decimals) == round(abs(limit), decimals):
+        decimals += 1
+    return f"{value:{sign}.{decimals}f}"
+
+
 def shown(value: object) -> str:
     """Return a value of a file for a message, at most 60 characters."""
     text = repr(value)
@@ -31,7 +38,7 @@ def without_digits(text: str) -> str:
 
 
 class CountedReasons:
-    """Counts reasons; those that differ in their numbers alone count as one, and the latest stands for all."""
+    """Counts reasons; those that differ in their numbers alone count as one, without these numbers."""
 
     def __init__(self) -> None:
         self._counts: dict[str, tuple[int, str]] = {}
@@ -39,8 +46,9 @@ class CountedReasons:
     def add(self, reason: str) -> None:
         """Count a reason."""
         kind = without_digits(reason)
-        count, _ = self._counts.get(kind, (0, ""))
-        self._counts[kind] = count + 1, reason
+        count, before = self._counts.get(kind, (0, reason))
+        words = zip(before.split(), reason.split(), strict=True)
+        self._counts[kind] = count + 1, " ".join(word if word == other else "…" for word, other in words)
 
     @property
     def total(self) -> int:

@@ -132,7 +132,7 @@ def test_the_most_frequent_reason_is_whole_and_counted_without_its_numbers():
     ]
     text = summary_of_hold(None, [], *refused)
     assert (
-        "4 of 64 torques of right were not valid and not used, most often: right fingertip: 51 channels jumped" in text
+        "4 of 64 torques of right were not valid and not used, most often: right fingertip: … channels jumped" in text
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.fault_detection import (
     ARM_STALE_S,
+    LONGEST_HANG_S,
     Grasp,
     RunningStep,
     Watched,
@@ -83,6 +84,15 @@ def test_each_supervising_sensor_is_compared_with_the_driving_one(supervising, o
     events = found(*heard, supervising=supervising)
     assert events.keys() == {FaultCode.TORQUES_DISAGREE}
     assert f"{other.name} -0.100 N·m" in events[FaultCode.TORQUES_DISAGREE]
+
+
+def test_no_value_beyond_its_limit_reads_as_the_limit():
+    senses = LatestInputs(HEARD_S, arm=FRESH_ARM)
+    senses.late_s = LONGEST_HANG_S + 0.001
+    limits = ExperimentLimits()
+    details = {one.code: one.detail for one in faults(senses, twisted_rad=-limits.angle_rad - 1e-5)}
+    assert details[FaultCode.DAEMON_PAUSED] == "it stood still for 0.32 s, and 0.3 s are allowed"
+    assert f"turned by {-limits.angle_rad - 1e-5:+.5f} rad" in details[FaultCode.ANGLE_LIMIT]
 
 
 def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike():

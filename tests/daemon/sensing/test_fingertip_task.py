@@ -483,7 +483,7 @@ async def test_tare_that_times_out_says_why_its_frames_were_refused():
             await task.process(frame(seq, clock.t_ns + (620 + seq) * MS))
         error = await waiting
     said = "the idle frame of right could not be taken within 0.2 s"
-    assert error == f"{said}: 3 frames: 7 channels jumped, 1 frame: nothing"
+    assert error == f"{said}: 3 frames: … channels jumped, 1 frame: nothing"
     async with running(task.tare_and_wait(0.01)) as (waiting,):
         assert (await waiting).endswith("no frame came")
     await task.process(frame(9, clock.t_ns + 9 * PERIOD_NS))

@@ -111,6 +111,13 @@ def test_what_began_before_the_viewer_is_not_dated_at_its_start():
     assert lines(loop("stopped", cause="the torque is old.", response="stop and keep grip"))[0][1].endswith(since)
 
 
+def test_a_standstill_before_the_decision_says_so():
+    """As after a pause of the daemon. The order seemed wrong: decided after 5.6 s, and standstill after 2.7 s."""
+    times = {"experiment": "hold", "decided_after_s": 5.625, "sent_after_s": 5.627, "stands_after_s": 2.652}
+    ((_, said),) = lines(("loop.stop", times))
+    assert said.endswith("decided after 5.625 s, sent after 5.627 s, standstill after 2.652 s, before the decision")
+
+
 def test_the_event_log_says_why_a_stop_was_not_sent():
     times = {"experiment": "hold", "decided_after_s": 0.0, "sent_after_s": None, "stands_after_s": 0.096}
     times |= {"refusal": "Nothing can be sent.", "blocked_after_s": 0.004}

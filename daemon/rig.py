@@ -43,6 +43,7 @@ from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.library import missing_library
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 from shearloop.errors import Hint, UserError
+from shearloop.yaml_files import Document
 
 if TYPE_CHECKING:
     # Only a rig that records loads it.
@@ -145,9 +146,6 @@ def configured_settings(config: DaemonConfig) -> UrSettings | None:
         return None
     settings = robot_settings(config.robot)
     if config.emulated and not is_loopback_host(settings.host):
-        # Only a mistake needs the lines of the file.
-        from shearloop.yaml_files import Document
-
         reason = (
             f"{settings.host} is not this computer, and the configuration says `emulated: true`: take that out for a "
             "real robot, or give 127.0.0.1 for an emulated one"

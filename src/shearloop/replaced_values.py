@@ -28,8 +28,8 @@ def with_values(
     for key, text in values.items():
         try:
             value = yaml.load(text, Loader)  # noqa: S506 - it is a SafeLoader
-        except yaml.MarkedYAMLError as error:
-            raise raises(f"{key}={text}: the value is not YAML: {syntax(error)}") from error
+        except yaml.YAMLError as error:
+            raise raises(f"{key}={text}: the value is not YAML: {syntax(error, text)}") from error
         _replace(content, key, value, lambda sentence: raises(f"{path}: {sentence}"))
         if isinstance(value, bool | int | float):
             given[tuple(int(part) if part.isdecimal() else part for part in key.split("."))] = text.strip()

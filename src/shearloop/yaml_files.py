@@ -65,15 +65,11 @@ class Document:
         except UnicodeDecodeError as error:
             from shearloop.binary_files import why_no_text
 
-            raise raises(f"{path}: the {what} {why_no_text(data, error.start)}") from error
-        except yaml.MarkedYAMLError as error:
-            from shearloop.yaml_mistakes import syntax
-
-            mark = error.problem_mark or error.context_mark
-            where = f"{path}:{mark.line + 1}:{mark.column + 1}" if mark else str(path)
-            raise raises(f"{where}: {syntax(error)}") from error
+            raise raises(f"{path}{why_no_text(data, error.start, what)}") from error
         except yaml.YAMLError as error:
-            raise raises(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+            from shearloop.yaml_mistakes import place_and_syntax
+
+            raise raises(f"{path}{place_and_syntax(error, data.decode())}") from error
         except RecursionError as error:
             raise raises(f"{path}: the {what} is nested too deeply") from error
         if content is None:

@@ -10,6 +10,12 @@ import yaml
 MAX_BYTES, _MAX_VALUES = 1 << 17, 20_000
 
 
+# Meant in no key and no value: characters without width, other blanks at an end, and typographic quotes around it all.
+_BLANK = "[\xa0\u1680\u2000-\u200a\u202f\u205f\u3000]"
+_MISREAD = re.compile(rf"[\xad\u200b\u2060\ufeff]|^{_BLANK}|{_BLANK}$|^[“”„‟«‘’‚].*[“”‟»‘’]$", re.DOTALL)
+MISREAD = "a character looks like another one, or like none"
+
+
 class Loader(yaml.SafeLoader):
     """A SafeLoader that refuses duplicate keys and type tags, bounds aliases, and knows neither dates nor base 60.
 
@@ -30,6 +36,8 @@ class Loader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         if node is None:
             return None
+        if isinstance(node, yaml.ScalarNode) and _MISREAD.search(node.value):
+            raise self._refusal(MISREAD, event)
         if node not in self._sizes:
             if isinstance(event, yaml.AliasEvent):
                 raise self._refusal("an alias stands within its anchor", event)

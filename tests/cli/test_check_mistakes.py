@@ -41,9 +41,9 @@ def said_of(tmp_path, ran, monkeypatch):
     """Return what `check` says of three files, any of them with other content; it refuses them."""
     monkeypatch.chdir(tmp_path)
 
-    def said(*arguments: str, rig: str = RIG, robot: str = ROBOT, experiment: str = EXPERIMENT) -> str:
+    def said(*arguments: str, rig: str = RIG, robot: str = ROBOT, experiment: str | bytes = EXPERIMENT) -> str:
         for name, content in (("rig.yaml", rig), ("ur.yaml", robot), ("e.yaml", experiment)):
-            Path(name).write_text(content, encoding="utf-8")
+            Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
         return ran("check", *(arguments or ("e.yaml", "--config", "rig.yaml")), status=2).err
 
     return said
@@ -111,3 +111,87 @@ def test_mistakes_in_three_files_are_shown_together(arguments, said_of):
     )
     places = re.findall(r"(\w+\.yaml):\d+: ([\w.\[\]]+): ", said)
     assert places == [("rig.yaml", "loop.kp"), ("ur.yaml", "limits.joints.margin_rad"), ("e.yaml", "steps[4].wait_s")]
+
+
+NO_BREAK, IDEOGRAPHIC = "\N{NO-BREAK SPACE}", "\N{IDEOGRAPHIC SPACE}"
+NO_WIDTH, BYTE_ORDER = "\N{ZERO WIDTH SPACE}", "\N{ZERO WIDTH NO-BREAK SPACE}"
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("name: one", "name one", "1:5: a `:` is missing behind the key"),
+        ("torque_source: load_cell", "torque_source load_cell", "2:14: a `:` is missing behind the key"),
+        ("- do: wait", "- do wait", "9:7: a `:` is missing behind the key"),
+        ("wait_s: 3", "wait_s", "10:11: a `:` is missing behind the key"),
+        ("wait_s: 3", "wait_s = 3", "10:11: a `:` is missing; write it instead of `=`"),
+        ("name: one", "name:one", "1:5: a space is missing behind the `:`"),
+        ("name: one", "name: one: two", "1:10: a second `:` stands in this line"),
+        ("- do: wait", "-do: wait", "9:4: a space is missing behind the `-`"),
+        ("- do: wait", "  do: wait", "9:5: a `-` is missing before this entry"),
+        ("- {do: tare", "  {do: tare", "6:5: a `-` is missing before this entry"),
+        ("    wait_s", "   wait_s", "10:4: this line is indented by 3 spaces, and a line above by 4"),
+        ("    wait_s", "     wait_s", "10:6: this line is indented by 5 spaces, and a line above by 4"),
+        ("    wait_s", "\twait_s", "10:1: a tab indents this line; use spaces"),
+        ("name: one", "name:\tone", "1:6: a tab stands in this line; use spaces"),
+        ("{do: tare, ", "{do: tare ", "6:14: a `,` is missing"),
+        ("{do: tare, ", "{do: tare; ", "6:14: a `,` is missing; write it instead of `;`"),
+        ("timeout_s: 30}", "timeout_s: 30", "a section is not closed: `,` or `}` is missing; it begins in line 6"),
+        ("timeout_s: 30}", "timeout_s: 30}}", "6:30: a `}` too many"),
+        ("name: one", 'name: "one" two', "1:13: something stands behind the value"),
+        ("name: one", 'name: "one', "1:7: the quote that opens here is not closed"),
+        ("name: one", 'name: "one”', "1:11: U+201D (right double quotation mark) stands here"),
+        ("name: one", 'name: "C:\\users"', "a backslash in double quotes has a meaning of its own"),
+        ("name: one", "name: %one", "1:7: no value begins with %; put it in quotes"),
+        ("name: one", "```yaml\nname: one", "1:1: a fence of Markdown; take this line out"),
+        ("name: one", "name: on\0e", "1:9: U+0000 is no character of a text; take it out"),
+        ("    wait_s", f"{NO_BREAK}   wait_s", "10:1: U+00A0 (no-break space) stands here; write a space"),
+        ("    wait_s", f"{IDEOGRAPHIC}  wait_s", "10:1: U+3000 (ideographic space) stands here; write a space"),
+        ("- do: wait", f"-{NO_BREAK}do: wait", "9:4: U+00A0 (no-break space) stands here"),
+        ("torque_source:", f"torque_source{NO_BREAK}:", "2:14: U+00A0 (no-break space) stands here"),
+        ("torque_source:", f"{BYTE_ORDER}torque_source:", "2:1: U+FEFF (zero width no-break space) stands here; take"),
+        (": load_cell", f": load_cell{NO_WIDTH}", "2:25: U+200B (zero width space) stands here; take it out"),
+        ("name: one", f"name:{NO_BREAK}one", "1:6: U+00A0 (no-break space) stands here"),
+        ("name: one", "name： one", "1:5: U+FF1A (fullwidth colon) stands here; write : instead"),
+        ("name: one", "name: „one“", "1:7: U+201E (double low-9 quotation mark) stands here"),
+        ("do: twist", "do: ‘twist’", "8:10: U+2018 (left single quotation mark) stands here"),
+        ("- do: wait", "– do: wait", "9:3: U+2013 (en dash) stands here; write - instead"),
+        ("- do: wait", "• do: wait", "9:3: U+2022 (bullet) stands here; write - instead"),
+        ("hold_s: 5", "hold_s: 5, hold_s: 6", "8:69: the key `hold_s` is given twice"),
+    ],
+)
+def test_a_slip_of_the_pen_is_named_where_it_stands(right, wrong, said, said_of):
+    assert f"{said}" in said_of("e.yaml", experiment=replaced(EXPERIMENT, right, wrong))
+
+
+@pytest.mark.parametrize("name", ["0.1\N{NO-BREAK SPACE}N·m", "a “slow” sweep", "one – two", "Prüfung 3 µm", "日本"])
+def test_a_name_has_the_characters_of_its_language(name, ran, tmp_path):
+    path = tmp_path / "e.yaml"
+    path.write_text(replaced(EXPERIMENT, "name: one", f"name: {name}"), encoding="utf-8")
+    assert f"plan of '{name}'".replace(NO_BREAK, "\\xa0") in ran("check", path).out
+
+
+def test_a_path_with_typographic_quotes_or_an_invisible_end_is_refused(said_of):
+    for port in ("“load”", f"load{NO_WIDTH}"):
+        said = said_of("rig.yaml", rig=replaced(RIG, "path: load", f"path: {port}"))
+        assert "rig.yaml:2:" in said
+        assert "U+20" in said
+
+
+@pytest.mark.parametrize(
+    ("encoding", "said"),
+    [
+        ("utf-16", "e.yaml: the file is text in UTF-16, and not in UTF-8; save the file with the encoding UTF-8"),
+        ("utf-16-le", "e.yaml: the file is text in UTF-16"),
+        ("utf-16-be", "e.yaml: the file is text in UTF-16"),
+        ("latin-1", "e.yaml:5:10: the byte 0xb7 is not UTF-8 text, and would be · in Windows-1252; save the file with"),
+    ],
+)
+def test_a_file_in_another_encoding_is_named_with_its_place_and_the_cure(encoding, said, said_of):
+    commented = replaced(EXPERIMENT, "steps:\n", "steps:\n  # 0.1 N·m\n")
+    assert said in said_of("e.yaml", experiment=commented.encode(encoding))
+
+
+def test_a_long_file_is_refused_without_many_readings(said_of):
+    long = EXPERIMENT + "  - {do: wait, wait_s: 3}\n" * 400 + "  - do wait\n    wait_s: 3\n"
+    assert "e.yaml:413:11: this line is indented deeper" in said_of("e.yaml", experiment=long)

@@ -206,7 +206,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
     [
         ("", "the configuration is empty"),
         ("# nothing\n", "the configuration is empty"),
-        ("torque_limit_nm: 1\nmode\nlow: 2\n", "a key without its `:`"),
+        ("torque_limit_nm: 1\nmode\nlow: 2\n", ":2:5: a `:` is missing behind the key"),
         ("- 1\n- 2\n", "expected keys and values such as `torque_limit_nm: …`"),
         ("torque_limit_nm: 1\nmode: [slow\n", ":3:1: a list is not closed"),
         ("torque_limit_nm: 1\n\tmode: slow\n", ":2:1: a tab indents this line; use spaces"),
@@ -224,7 +224,7 @@ ALIAS_BOMB = "a: &a [x]\n" + "".join(f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n"
         ("spare: {<<: {hold_s: 1}}\n", ":1:9: the keys `<<` and `=` are not supported"),
         ("low: 1\n---\nlow: 2\n", ":2:1: a second document begins here"),
         ("mode: *other\n", ":1:7: an alias `*name` without its anchor"),
-        ("mode: \x00\n", "not a YAML file: unacceptable character"),
+        ("mode: \x00\n", ":1:7: U+0000 is no character of a text; take it out"),
         ("[" * 500, "nested too deeply"),
         ("torque_limit_nm: .nan\n", "nan is not a finite number; allowed: from 0.05 to 2"),
         ("torque_limit_nm: 1\nwhat: 1\n", "2: what: is not a known key; allowed: torque_limit_nm, mode, steps, spare"),
@@ -293,7 +293,7 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
             load_yaml_model(tmp_path / "binary", Outer)
     assert {ARCHIVE_MAGIC, BANK_MAGIC, MCAP0_MAGIC[:5]} < FIRST_BYTES.keys()
     (tmp_path / "latin.yaml").write_bytes(b"mode: sl\xf6w\n")
-    with pytest.raises(UserError, match=r"latin\.yaml: the configuration is not UTF-8 text \(byte 8\)"):
+    with pytest.raises(UserError, match=r"latin\.yaml:1:9: the byte 0xf6 is not UTF-8 text, and would be ö in"):
         load_yaml_model(tmp_path / "latin.yaml", Outer)
 
 

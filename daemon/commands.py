@@ -43,8 +43,9 @@ ARGUMENTS: Mapping[str, Mapping[str, type]] = {
 # earliest, until when it may begin, and the sender's own name of the request.
 _OF_ALL: Mapping[str, type] = {"instance": str, "asked_ns": int, "until_ns": int, "request_id": str}
 _KINDS: Mapping[type, str] = {bool: "true or false", int: "a whole number", str: "text"}
+PAUSE = "pause"
 STOP_DELAY_S = 0.05
-# A request that does not say when it was asked for may be as old.
+# A request that does not say when it was asked for may be this old.
 _OLDEST_S = 5.0
 _LOOK_AGAIN = "look at the rig, and send it again"
 _ANOTHER_DAEMON = f"it is meant for an earlier daemon, and this one has begun since; {_LOOK_AGAIN}"
@@ -83,8 +84,8 @@ class Commands:
     report: Callable[["Answered"], None] = lambda _: None
     running_rig: RunningRig = field(default_factory=RunningRig)
     now_ns: Callable[[], int] = boot_ns
-    # When the latest stop came, by `now_ns`.
-    _stopped_ns: int | None = field(default=None, init=False)
+    # The latest `stop` or `pause`, and when it came, by `now_ns`.
+    _latest_halt: tuple[str, int] | None = field(default=None, init=False)
     # Sender, `request_id` and refusal of the latest stops that have one.
     _latest_stops: deque[tuple[Any, Any, str | None]] = field(default_factory=lambda: deque(maxlen=16), init=False)
 
@@ -99,7 +100,7 @@ class Commands:
             "tare": self._tare,
             STOP: self._stop,
             "start": self._start,
-            "pause": self._pause,
+            PAUSE: self._pause,
             "resume": self._resume,
             "unlock": self._unlock,
             "release": self._release,
@@ -113,9 +114,11 @@ class Commands:
             if name != STOP and not self._is_for_this_one(request):
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in MAY_BE_UNBOUND and not request.get("ask"):
-                _refuse_if(_why_unbound(name, request) or self._why_stopped_since(request))
+                _refuse_if(_why_unbound(name, request) or self._why_halted_since(request))
             if name not in NEVER_LATE:
                 _refuse_if(self._deadline(request).why_passed())
+            if name in (STOP, PAUSE):
+                self._latest_halt = name, self.now_ns()
             reply = await handler(request)
             refusal = None
         except CommandRefusedError as error:
@@ -129,16 +132,17 @@ class Commands:
                 self.report(Answered(name, request, refusal))
         return reply
 
-    def _why_stopped_since(self, request: Request) -> str | None:
-        """Return why a stop ends a request that lets something move, or None: a stop can overtake an older request."""
-        if self._stopped_ns is None:
+    def _why_halted_since(self, request: Request) -> str | None:
+        """Return why a stop or a pause, which can overtake an older request, ends one that lets something move."""
+        if self._latest_halt is None:
             return None
+        halt, came_ns = self._latest_halt
         if "asked_ns" not in request:
-            ago_s = (self.now_ns() - self._stopped_ns) / 1e9
-            unsure = "and without `asked_ns` nothing shows that this request is of later"
-            cure = f"{_LOOK_AGAIN} with it, or {_OLDEST_S:g} s after the stop"
-            return f"a stop came {ago_s:.1f} s ago, {unsure}; {cure}" if ago_s <= _OLDEST_S else None
-        return f"a stop came after it was asked for; {_LOOK_AGAIN}" if request["asked_ns"] <= self._stopped_ns else None
+            ago_s = (self.now_ns() - came_ns) / 1e9
+            unsure = "and without `asked_ns` nothing shows that this request was asked for later"
+            cure = f"{_LOOK_AGAIN} with it, or {_OLDEST_S:g} s after the {halt}"
+            return f"a {halt} came {ago_s:.1f} s ago, {unsure}; {cure}" if ago_s <= _OLDEST_S else None
+        return f"a {halt} came after it was asked for; {_LOOK_AGAIN}" if request["asked_ns"] <= came_ns else None
 
     def _is_for_this_one(self, request: Request) -> bool:
         """Return whether a request is meant for this daemon, and not for one before it."""
@@ -289,7 +293,6 @@ class Commands:
         return {"tasks": tasks, "daemon": daemon, "loop": self.rig.state(), "cap": self.health.cap()}
 
     async def _stop(self, request: Request) -> Reply:
-        self._stopped_ns = self.now_ns()
         # The instance shows a page that it displayed another daemon.
         return {**self._stopped(request), "process": os.getpid(), "instance": self.running_rig.instance}
 

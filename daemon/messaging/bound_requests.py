@@ -21,7 +21,7 @@ def meant_for(status: Mapping[str, Any], age_s: float, within_s: float) -> dict[
     """Return what binds a request to the daemon that gave this reply to `status`, and to the operator's act.
 
     The act was at most `age_s` ago when the reply came. A daemon that begins later refuses the request. This one
-    refuses it later than `within_s` after the act, or after a `stop` that came since then. Raises LateRequestError if
+    refuses it later than `within_s` after the act, or after a `stop` or `pause` since then. Raises LateRequestError if
     no time is left. Nothing binds it to a daemon that does not say which one it is, or what its clock shows.
     """
     if age_s > within_s:

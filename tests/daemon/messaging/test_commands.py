@@ -181,6 +181,33 @@ async def test_a_stop_ends_every_request_that_was_asked_for_before_it(name):
     assert "a stop came" not in await refusal(undated)
 
 
+async def test_a_pause_ends_a_resume_that_was_asked_for_before_it():
+    """The daemon read the pause before the older resume, and the wrist turned on after it."""
+    now_ns, paused = 7_000_000_000, []
+    loop = SimpleNamespace(pause=lambda: paused.append(True), resume=paused.clear)
+    commands = Commands(
+        SimpleNamespace(control_loop=loop), None, None, None, asyncio.Event(), None, now_ns=lambda: now_ns
+    )
+    handlers = commands.handlers()
+
+    def asked(at_ns: int) -> dict[str, int | str]:
+        return {"instance": commands.running_rig.instance, "asked_ns": at_ns, "until_ns": now_ns + 1_000_000_000}
+
+    before_ns = now_ns - 1
+    await handlers["pause"](asked(now_ns))
+    with pytest.raises(CommandRefusedError, match=r"^a pause came after it was asked for; look at the rig"):
+        await handlers["resume"](asked(before_ns))
+    assert paused
+    undated = {key: value for key, value in asked(now_ns).items() if key != "asked_ns"}
+    with pytest.raises(CommandRefusedError, match=r"^a pause came 0\.0 s ago, and without `asked_ns`.* the pause$"):
+        await handlers["resume"](undated)
+    # An older pause lets nothing move.
+    await handlers["pause"](asked(before_ns))
+    now_ns += 1_000_000
+    await handlers["resume"](asked(now_ns))
+    assert not paused
+
+
 async def test_a_stop_that_is_sent_again_is_reported_once():
     """The one that ends an idle daemon is sent again with its time, and was recorded twice."""
     told: list[Answered] = []

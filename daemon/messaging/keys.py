@@ -83,8 +83,14 @@ def server_cure(folder: Path) -> str:
 
 
 def load_public_key(path: Path, cure: str) -> bytes:
-    """Return the public key of a file; raises UserError, which ends with the cure, if it holds none."""
-    return _load(path, cure)[0]
+    """Return the public key of a file; raises UserError for a secret key, and with the cure where there is none."""
+    public, secret = _load(path, cure)
+    if secret is not None:
+        raise UserError(
+            f"{path} holds a secret key, which never leaves its computer: give the file that ends in .key, and make a "
+            "new pair if another user may have read this one"
+        )
+    return public
 
 
 def load_key_pair(path: Path, cure: str) -> KeyPair:

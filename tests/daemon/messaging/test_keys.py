@@ -21,6 +21,7 @@ from shearloop.daemon.messaging.client import Subscriber
 from shearloop.daemon.messaging.keys import (
     ClientKeys,
     KeyPair,
+    allowed_clients,
     check_allowed_clients,
     load_key_pair,
     load_public_key,
@@ -251,6 +252,21 @@ def test_a_folder_is_no_key(keys):
         ClientKeys.load(keys, keys / "keys/server.key")
 
 
+def test_a_secret_key_is_taken_for_no_public_one(keys, mistake, result_of):
+    """It never leaves its computer, and the folder of allowed clients is readable by every user."""
+    made = keys / "eve"
+    secret = Path(result_of("keys", "client", "--dir", made)["secret_file"])
+    said = f"{secret} holds a secret key, which never leaves its computer: give the file that ends in .key"
+    assert said in mistake("keys", "allow", secret, "--name", "eve", "--dir", keys / "keys")
+    assert not (keys / "keys/clients/eve.key").exists()
+    (keys / "keys/clients/eve.key").write_text(secret.read_text())
+    clients = allowed_clients(keys / "keys/clients")
+    assert list(clients.names.values()) == ["ada"]
+    assert "eve.key holds a secret key" in clients.unusable[0]
+    with pytest.raises(UserError, match=r"server\.key_secret holds a secret key"):
+        ClientKeys.load(keys / "ada/client.key_secret", keys / "keys/server.key_secret")
+
+
 def test_keys_of_the_daemon_are_made_on_its_computer(tmp_path, keys, mistake):
     """Somebody may type these on a client's computer."""
     client, none = keys / "ada/client.key", tmp_path / "none"
@@ -297,7 +313,7 @@ def test_a_damaged_key_is_an_error(keys):
         ("", "is no key file"),
         ('public-key = "short"\n', "damaged key"),
         (f'public-key = "{other.public.decode()}"\n', "holds no secret key"),
-        (secret.read_text().replace(load_public_key(secret, "").decode(), other.public.decode()), "do not match"),
+        (secret.read_text().replace(load_key_pair(secret, "").public.decode(), other.public.decode()), "do not match"),
     ):
         secret.write_text(text)
         with pytest.raises(UserError, match=part):

@@ -16,6 +16,8 @@ from shearloop.words import beyond
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
 GRIPPER_STALE_S = stale_after_s("gripper.state")
+# Torques of two fingertips whose acquisitions do not meet are of two moments: a turn changes the torque between them.
+LONGEST_APART_S = 0.25
 # The loop decides on each of the robot's states; a longer interval is late.
 LONGEST_TICK_S = 0.02
 # A loop later than this turned the wrist on a stale state.
@@ -276,7 +278,7 @@ def _torque_at(inputs: LatestInputs, source: TorqueSource, t_ns: int, half_s: fl
     if not neighbours:
         return None
     nearest = min(neighbours, key=lambda at: abs(times_ns[at] - t_ns))
-    farthest_ns = half_ns + STALE_AFTER_PERIODS * source.period_s * 1e9
+    farthest_ns = half_ns + min(STALE_AFTER_PERIODS * source.period_s, LONGEST_APART_S) * 1e9
     return torques_nm[nearest] if abs(times_ns[nearest] - t_ns) <= farthest_ns else None
 
 

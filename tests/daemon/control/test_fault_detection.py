@@ -166,6 +166,19 @@ def test_torques_of_other_moments_are_not_compared():
     assert FaultCode.TORQUES_DISAGREE not in found(load, wrench, driving=LOAD, supervising=(WRENCH,))
 
 
+@pytest.mark.parametrize("driving", ["left", "right"])
+def test_a_fingertip_that_falls_silent_in_a_turn_is_not_compared_with_later_torques_of_the_other(driving):
+    """Its last torque was held against the other's newest one, 1.1 s later. Before, the two agreed."""
+    left, right = replace(EIT, name="left", min_fresh_s=5.0), replace(EIT, min_fresh_s=5.0)
+    sources = (left, right) if driving == "left" else (right, left)
+    turned = [torque(left, 0.2 - 0.05 * before, came_s=before * EIT.period_s) for before in range(5, -1, -1)]
+    turned += [torque(right, 0.2 - 0.05 * before, came_s=before * EIT.period_s + 0.1) for before in range(5, 1, -1)]
+    assert FaultCode.TORQUES_DISAGREE not in found(*turned, driving=sources[0], supervising=sources[1:])
+    # A disagreement of one moment lasts.
+    turned[-1] = replace(turned[-1], torque_nm=0.3)
+    assert FaultCode.TORQUES_DISAGREE in found(*turned, driving=sources[0], supervising=sources[1:])
+
+
 def test_a_wrench_whose_torque_does_not_come_with_the_robots_state_holds_the_wrist_and_says_why():
     """States that come too slowly are fresh, but make no mean: the wrench would supervise nothing, without a word."""
     arm, heard = ArmStatus(0.0, NOW_NS, no_torque="13 states came"), (torque(EIT, 0.1), torque(LOAD, 0.1))

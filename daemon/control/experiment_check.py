@@ -7,6 +7,7 @@ from itertools import repeat
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.decimal_commas import DECIMAL_POINT, may_be_decimals
 from shearloop.daemon.control.experiment_schema import (
     AdaptStep,
     ApproachStep,
@@ -131,7 +132,10 @@ def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap:
         yield f"{step.do} asks for {needs.torque_nm:g} N·m, and its limit is {limits.torque_nm:g} N·m; {cure}"
     if needs.angle_rad >= limits.angle_rad:
         asks = f"{step.do} asks for {needs.angle_rad:g} rad, and its limit is {limits.angle_rad:g} rad"
-        yield f"{asks}; raise limits.angle_rad, or ask for less"
+        if isinstance(step, TwistStep) and may_be_decimals(step.angles_rad):
+            yield f"{asks}; {DECIMAL_POINT}, or raise limits.angle_rad"
+        else:
+            yield f"{asks}; raise limits.angle_rad, or ask for less"
     if step.timeout_s is not None and needs.stands_s >= step.timeout_s:
         asks = f"{step.do} stands still for {needs.stands_s:g} s in all, and its timeout is {step.timeout_s:g} s"
         yield f"{asks}; raise timeout_s"

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 from shearloop.daemon.control import experiment_schema as steps
+from shearloop.daemon.control.decimal_commas import DECIMAL_POINT, are_probably_decimals
 from shearloop.daemon.control.experiment_schema import ExperimentFile, Step
 from shearloop.daemon.control.known_tool import AT_REST, NOTHING_KNOWN, KnownTool, known_after
 from shearloop.daemon.control.step_demands import demands
@@ -435,6 +436,8 @@ def _notes(file: ExperimentFile, step: Step, turn: Turn, robot: UrLimits | None,
         most_mm = max(0.0, file.tool_mm - FELT_MM)
         cure = f": make `width_mm` at most {most_mm:g}" if step.width_mm > most_mm else ""
         yield f"the gripper may not feel the tool of {file.tool_mm:g} mm{cure}"
+    if isinstance(step, steps.TwistStep) and are_probably_decimals(step.angles_rad):
+        yield f"it turns the tool far, by whole numbers of rad: {DECIMAL_POINT}"
     if turn.turns_tool:
         limits = file.limits_of(step)
         if step.limits is not None:

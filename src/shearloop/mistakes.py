@@ -15,8 +15,9 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from shearloop.lookalikes import note_on
 from shearloop.units import unit_hint, unit_of
-from shearloop.words import counted, shown
+from shearloop.words import LONGEST_VALUE, counted, shown
 
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
@@ -25,7 +26,17 @@ _NAMED_KEY = re.compile(r"(?:^|`)([a-z][a-z0-9_.]*)(?:: |`)")
 _POINT = "; the decimal sign is a point: 0.1, not 0,1"
 # The largest number of mistakes that are shown for one file.
 _MAX_MISTAKES = 100
+# A number with its unit.
+_WITH_UNIT = re.compile(r"[-+−]?[0-9]*[.,]?[0-9]+ *[A-Za-zµμ°%·²/]+[0-9²]*")
+# The kinds of files that are taken for another one, each with keys that no other kind has.
+_KINDS_OF_FILES = (
+    ("an experiment", {"steps"}),
+    ("the robot's settings", {"host"}),
+    ("a configuration", {"fingertips", "skin", "load_cell", "gripper", "robot"}),
+)
 
+# The library's names of a key that no model has.
+_UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
 # The library's words for frequent mistakes, and ours.
 _WRONG = (
     ("finite_number", "is not a finite number"),
@@ -78,6 +89,8 @@ def mistake_lines(
     schema = _schema_of(model)
     found: dict[str, int] = {}
     every = error.errors(include_url=False)
+    if kind_of_file := _other_kind(every, content):
+        return [f"{where}{':1' if root is not None else ''}: this is {kind_of_file}; name another file here"]
     first, more = every[:_MAX_MISTAKES], every[_MAX_MISTAKES:]
     for details in first:
         location = details["loc"]
@@ -94,7 +107,12 @@ def mistake_lines(
         if kind.startswith("union_tag"):
             key += "." + details["ctx"]["discriminator"].strip("'")
         subject = f"{key}: " if key else ""
-        sentence = _sentence(details, schema, _written(location, content, root, key=wrong_key))
+        written = _written(location, content, root, key=wrong_key)
+        sentence = _sentence(details, schema, written, _shown_at(details, content, root))
+        if kind in _UNKNOWN_KEY:
+            sentence += note_on(_written(location, content, root, key=True))
+        elif kind.startswith(("float_", "int_", "bool_", "literal_", "union_tag_")):
+            sentence += note_on(written)
         if kind == "value_error":
             line = _line_of_named(sentence, location, content, root) or line
         is_number = wrong_key and _written(location, content, root, key=True).isdecimal()
@@ -105,6 +123,34 @@ def mistake_lines(
     return sorted(found, key=lambda text: found[text]) + (
         [f"{where}: {counted(len(more), 'more mistake')}"] if more else []
     )
+
+
+def _other_kind(every: Sequence[ErrorDetails], content: object) -> str:
+    """Return the kind of file that this content is of, where most of its keys are unknown; else an empty text."""
+    unknown = {one["loc"][0] for one in every if len(one["loc"]) == 1 and one["type"] in _UNKNOWN_KEY}
+    if not isinstance(content, Mapping) or 2 * len(unknown) <= len(content):
+        return ""
+    return next((kind for kind, keys in _KINDS_OF_FILES if keys & unknown), "")
+
+
+def _shown_at(details: ErrorDetails, content: object, root: yaml.Node | None) -> str:
+    """Return the value of a mistake for its sentence: a list or a section as it stands in the file."""
+    node = _node_at(details["loc"], content, root, key=False)
+    if isinstance(node, yaml.CollectionNode) and isinstance(details["input"], list | tuple | dict):
+        text = _in_one_line(node)
+        return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+    return shown(details["input"])
+
+
+def _in_one_line(node: yaml.Node) -> str:
+    """Return a value of a file as it is written, on one line."""
+    if isinstance(node, yaml.CollectionNode) and node.flow_style and node.start_mark.buffer is not None:
+        return " ".join(node.start_mark.buffer[node.start_mark.pointer : node.end_mark.pointer].split())
+    if isinstance(node, yaml.SequenceNode):
+        return f"[{', '.join(map(_in_one_line, node.value))}]"
+    if isinstance(node, yaml.MappingNode):
+        return f"{{{', '.join(f'{_in_one_line(name)}: {_in_one_line(value)}' for name, value in node.value)}}}"
+    return str(node.value)
 
 
 def place_of(
@@ -155,8 +201,8 @@ def _pair(content: Mapping[Any, object], key: Any, node: yaml.MappingNode) -> tu
     return name, value
 
 
-def _written(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> str:
-    """Return the value at a location as it is written in the file, or its key; else an empty text."""
+def _node_at(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> yaml.Node | None:
+    """Return the node of the value at a location in the file, or of its key; None for one that is missing."""
     name = node
     for part in location:
         if isinstance(content, Mapping) and isinstance(node, yaml.MappingNode):
@@ -166,11 +212,15 @@ def _written(location: Sequence[int | str], content: object, node: yaml.Node | N
                 content = content[written]
         elif isinstance(content, list) and isinstance(part, int) and isinstance(node, yaml.SequenceNode):
             if part >= len(content):
-                # The entry is missing.
-                return ""
+                return None
             name = node = node.value[part]
             content = content[part]
-    wrong = name if key else node
+    return name if key else node
+
+
+def _written(location: Sequence[int | str], content: object, node: yaml.Node | None, *, key: bool) -> str:
+    """Return the value at a location as it is written in the file, or its key; else an empty text."""
+    wrong = _node_at(location, content, node, key=key)
     return str(wrong.value) if isinstance(wrong, yaml.ScalarNode) else ""
 
 
@@ -180,7 +230,8 @@ def _unquoted(found: object, written: str, what: str) -> str:
     return f"{what}{written or shown(found)} without quotes is {read_as}, and no text; put it in quotes"
 
 
-def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "") -> str:
+def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str, value: str) -> str:
+    """Return a mistake in words; `written` is its scalar or key as in the file, `value` what the sentence shows."""
     location, kind, found = details["loc"], details["type"], details["input"]
     if kind == "invalid_key" or (kind == "string_type" and location[-1:] == ("[key]",)):
         if isinstance(found, bool):
@@ -188,8 +239,8 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "
         return f"the key {written or shown(found)} is a number; a name is expected"
     if kind == "string_type" and isinstance(found, bool | int | float):
         return f'{_unquoted(found, written, "")}: "{written or found}"'
-    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        return f"is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
+    if kind in _UNKNOWN_KEY:
+        return f"is not a known key{_known_keys(location, schema)}"
     if kind in ("value_error", "assertion_error"):
         return details["msg"].split(", ", 1)[1]
     here = _schema_at(schema, location, schema)
@@ -205,11 +256,14 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any], written: str = "
         if found in ("true", "false") and kind.startswith(("float_", "int_")):
             return "is true or false, which YAML also reads from yes and no; write a number"
         wrong = (words for begin, words in _WRONG if kind.startswith(begin))
-        sentence = f"{shown(found)} {next(wrong, details['msg'])}"
+        sentence = "has no value" if found is None else f"{value} {next(wrong, details['msg'])}"
     if isinstance(found, str) and _DECIMAL_COMMA.fullmatch(found) and kind.startswith(("float_", "int_")):
         sentence += _POINT
+    if kind == "too_long" and all(isinstance(one, int) for one in found):
+        # YAML takes a decimal comma in a list for the next entry.
+        sentence += _POINT
     near = get_close_matches(str(found), choices, 1)
-    hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here)
+    hint = f"did you mean {near[0]}?" if near else _unit_hint(location, found, here) or _form_hint(details, here)
     return "; ".join(filter(None, (sentence, f"allowed: {allowed}" if allowed else "", hint)))
 
 
@@ -223,8 +277,42 @@ def _unit_hint(location: Sequence[int | str], found: object, schema: Mapping[str
     return unit_hint(found, schema.get("unit") or unit_of(key), low, high)
 
 
-def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
+def _form_hint(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
+    """Return how a value of another form is written, or an empty text."""
+    kind, found = details["type"], details["input"]
+    if isinstance(found, str) and kind.startswith(("float_", "int_")) and _WITH_UNIT.fullmatch(found):
+        key = next((part for part in reversed(details["loc"]) if isinstance(part, str)), "")
+        unit = schema.get("unit") or unit_of(key)
+        return f"write the number alone{f', in {unit}' if unit else ''}"
+    if isinstance(found, dict) and kind.startswith(("list_", "tuple_")):
+        return "each entry of a list begins with `- `"
+    tag = schema.get("discriminator", {})
+    kinds, name = tag.get("mapping", {}), tag.get("propertyName", "")
+    if isinstance(found, str) and found in kinds:
+        return f"write `{name}: {found}`"
+    if isinstance(found, dict) and (glued := next((key for key in found if str(key).startswith(f"{name}:")), None)):
+        return f"a space is missing in `{glued}`"
+    if isinstance(found, dict) and (named := next((key for key in found if key in kinds), None)):
+        return f"write `{name}: {named}`, and its keys beside it"
+    if kind.startswith(("model_", "dataclass_")) and (keys := schema.get("properties")):
+        return f"its keys are {', '.join(keys)}"
+    return ""
+
+
+def _sections_with(key: str, schema: Mapping[str, Any], root: Mapping[str, Any]) -> list[str]:
+    """Return the sections directly below a schema that have a key."""
+    sections = schema.get("properties", {})
+    return [name for name in sections if key in _schema_at(schema, (name,), root).get("properties", {})]
+
+
+def _known_keys(location: Sequence[int | str], root: Mapping[str, Any]) -> str:
+    """Return which key was probably meant by the unknown one at a location, its place, or the known ones."""
+    wrong, schema = str(location[-1]), _schema_at(root, location[:-1], root)
     known = list(schema.get("properties", {}))
+    if sections := _sections_with(wrong, schema, root):
+        return f"; it belongs in {' or '.join(f'`{name}`' for name in sections[:3])}"
+    if len(location) > 1 and wrong in root.get("properties", {}):
+        return "; it belongs in no section: write it without indentation"
     # Often the unit is missing: `speed` for `speed_rad_per_s`.
     near = get_close_matches(wrong, known, n=1) or [name for name in known if name.startswith(f"{wrong}_")]
     if near:

@@ -1,6 +1,6 @@
 """Numbers and values in words and in digits, and sentences that differ in their numbers alone."""
 
-_LONGEST_VALUE = 60
+LONGEST_VALUE = 60
 
 
 def times(count: int) -> str:
@@ -23,7 +23,7 @@ def beyond(value: float, limit: float, decimals: int, sign: str = "") -> str:
 def shown(value: object) -> str:
     """Return a value of a file for a message, at most 60 characters."""
     text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
 
 
 def is_whole_number(text: str, most_digits: int) -> bool:

@@ -25,6 +25,7 @@ _SYNTAX = (
     ("found unexpected end of stream", "the quote that opens here is not closed"),
     ("found unknown escape", "a backslash in double quotes has a meaning of its own; use single quotes"),
     ("expected escape sequence", "a backslash in double quotes has a meaning of its own; use single quotes"),
+    ("expected a comment or a line break", "`>` and `|` begin a text of several lines; put this text in quotes"),
     ("found unhashable key", "a key is a list or a section; a name is expected"),
     ("could not determine a constructor", "the keys `<<` and `=` are not supported"),
     ("but found another document", "a second document begins here; a file has one"),

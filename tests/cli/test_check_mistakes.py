@@ -195,3 +195,66 @@ def test_a_file_in_another_encoding_is_named_with_its_place_and_the_cure(encodin
 def test_a_long_file_is_refused_without_many_readings(said_of):
     long = EXPERIMENT + "  - {do: wait, wait_s: 3}\n" * 400 + "  - do wait\n    wait_s: 3\n"
     assert "e.yaml:413:11: this line is indented deeper" in said_of("e.yaml", experiment=long)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("wait_s: 3", "wait_s: [yes]", "steps[4].wait_s: [yes] is not a number"),
+        ("wait_s: 3", "wait_s: {a: no}", "steps[4].wait_s: {a: no} is not a number"),
+        ("wait_s: 3", "wait_s:\n      - yes\n      - 3", "steps[4].wait_s: [yes, 3] is not a number"),
+        ("wait_s: 3", "wait_s:", "steps[4].wait_s: has no value; allowed"),
+        ("wait_s: 3", "wait_s: 3 s", "steps[4].wait_s: '3 s' is not a number; allowed: from 0 to 86400; write the "
+         "number alone, in s"),
+        ("[0.2]", "[20°]", "write the number alone, in rad"),
+        ("[0.2]", "[−0.2]", "is not a number; allowed: from -6.2832 to 6.2832; at the beginning, U+2212 (minus sign)"),
+        ("torque_source", "torque\N{NO-BREAK SPACE}source", "did you mean torque_source?; behind 'torque', U+00A0"),
+        ("do: twist", "do:twist", "8: steps[3].do: is missing; a space is missing in `do:twist`"),
+        ("- do: wait", "- wait:", "9: steps[4].do: is missing; write `do: wait`, and its keys beside it"),
+        ("{do: tare, timeout_s: 30}", "tare", "steps[1]: 'tare' is not a section with keys; write `do: tare`"),
+        (STEPS, "  do: wait\n", "steps: {do: wait} is not a list; each entry of a list begins with `- `"),
+        ("limits: {torque_nm: 0.25, angle_rad: 1.5}", "angle_rad: 1.5", "angle_rad: is not a known key; it belongs in "
+         "`limits`"),
+        ("hold_s: 5", "hold_s: 5, tool_mm: 9", "steps[3].tool_mm: is not a known key; it belongs in no section"),
+        ("{do: tare, timeout_s: 30}", "{do: approach, pose_m_rad: [0,4, 0,1, 0,3, 0, 3,14, 0]}", "[0,4, 0,1, 0,3, 0, "
+         "3,14, 0] has too many entries; the decimal sign is a point: 0.1, not 0,1"),
+        ("[0.2]", "[0,2]", "steps[3]: twist asks for 2 rad, and its limit is 1.5 rad; if these are decimals, the "
+         "decimal sign is a point"),
+        ("[0.2]", "[2]", "its limit is 1.5 rad; raise limits.angle_rad, or ask for less"),
+    ],
+)  # fmt: skip
+def test_a_value_is_refused_as_it_is_written_and_with_the_cure(right, wrong, said, said_of):
+    assert said in said_of("e.yaml", experiment=replaced(EXPERIMENT, right, wrong))
+
+
+@pytest.mark.parametrize(
+    ("angles", "noted"),
+    [
+        ("[0,2]", True),
+        ("[0,2, 0,3]", True),
+        ("[0, 1, 2]", False),
+        ("[1, 2]", False),
+        ("[2]", False),
+        ("[0.0, 0.2]", False),
+    ],
+)
+def test_a_large_turn_by_what_may_be_a_decimal_comma_is_pointed_out(angles, noted, ran, tmp_path):
+    path = tmp_path / "e.yaml"
+    content = replaced(replaced(EXPERIMENT, "angle_rad: 1.5", "angle_rad: 6"), "[0.2]", angles)
+    path.write_text(content, encoding="utf-8")
+    assert ("the decimal sign is a point" in ran("check", path).out) is noted
+
+
+@pytest.mark.parametrize(
+    ("named", "is_"),
+    [
+        ("robot: e.yaml", "e.yaml:1: this is an experiment; name another file here"),
+        ("robot: rig.yaml", "rig.yaml:1: this is a configuration; name another file here"),
+        ("robot: ur.yaml\nexperiment: rig.yaml", "rig.yaml:1: this is a configuration; name another file here"),
+        ("robot: ur.yaml\nexperiment: ur.yaml", "ur.yaml:1: this is the robot's settings;"),
+    ],
+)
+def test_a_file_of_another_kind_is_one_mistake(named, is_, said_of):
+    said = said_of("rig.yaml", rig=replaced(RIG, "robot: ur.yaml", named))
+    assert is_ in said
+    assert len(said.splitlines()) == 1

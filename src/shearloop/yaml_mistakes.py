@@ -34,7 +34,7 @@ _SYNTAX = (
 # Errors that the library sees only after their cause, which is where it began to read.
 _BEGAN_BEFORE = ("could not find expected ':'", "found unexpected end of stream")
 _CANNOT_BEGIN = re.compile(r"found character '(.)' that cannot start any token")
-_KEY = r"(?P<before>\s*(?:- +)*\{?)(?P<key>[A-Za-z]\w*)"
+_KEY = r"(?P<before>\s*(?:- +)*\{?)(?P<key>[a-z]\w*)"
 
 
 class _Cure(NamedTuple):
@@ -47,6 +47,13 @@ class _Cure(NamedTuple):
 
 _CURES = (
     _Cure(re.compile(r"^ *```.*$"), "", "a fence of Markdown; take this line out"),
+    _Cure(re.compile(r"^(<<<<<<<|=======|>>>>>>>).*$"), "", "a mark of a merge conflict; keep one side, without marks"),
+    _Cure(
+        re.compile(r"^(?P<before> *)(?P<key>)(\*|\+|--|[0-9]+[.)])(?= +\S)"),
+        r"\g<before>-",
+        "an entry begins with `- `",
+    ),
+    _Cure(re.compile(r"^(?P<before> *- +)(?P<key>)(?=[a-z]\w*:[^{]*\} *$)"), r"\g<before>{", "a `{` is missing"),
     _Cure(re.compile(rf"^{_KEY}:(?=[^\s:])"), r"\g<before>\g<key>: ", "a space is missing behind the `:`"),
     _Cure(re.compile(rf"^{_KEY} *= *"), r"\g<before>\g<key>: ", "a `:` is missing; write it instead of `=`"),
     _Cure(re.compile(r"^(?P<before> *)(?P<key>-)(?=[A-Za-z{])"), r"\g<before>- ", "a space is missing behind the `-`"),
@@ -145,7 +152,8 @@ def _moved(lines: Sequence[str], number: int) -> Iterator[tuple[int, str, str]]:
         entry = re.match(r"( *- +)\{?(\w*)", above)
         if entry is not None and begins is not None and entry[2] == begins[1]:
             yield blank, entry[1] + text, "a `-` is missing before this entry"
-        for other in {len(entry[1]) if entry is not None else 0, len(above) - len(above.lstrip(" "))} - {blank}:
+        indents = [len(above) - len(above.lstrip(" ")), *([len(entry[1])] if entry is not None else [])]
+        for other in indents:
             words = f"this line is indented by {counted(blank, 'space')}, and a line above by {other}"
             yield blank, " " * other + text, words
 
@@ -169,6 +177,8 @@ def _words(error: yaml.MarkedYAMLError, problem: str, before: str) -> str:
         return f"no value begins with {found[1]}; put it in quotes"
     if r"'\t'" in problem and before.strip():
         return "a tab stands in this line; use spaces"
+    if re.match(r"the key `[0-9]+` is given twice", problem):
+        return f"{problem}; a `,` begins another key, so write a point"
     opened = error.context_mark
     for begin, what, end in (("expected ',' or ']'", "list", "]"), ("expected ',' or '}'", "section", "}")):
         if problem.startswith(begin):
@@ -182,7 +192,7 @@ def _words(error: yaml.MarkedYAMLError, problem: str, before: str) -> str:
         if closing := re.search(r"'([\]}])'", problem):
             return f"a `{closing[1]}` too many"
         if before.strip(" -"):
-            return "something stands behind the value; take it out, or put the whole text in quotes"
+            return "something stands behind the value; take it out, or put the whole text in double quotes"
         if "collection" in str(error.context):
             return "this line does not begin with `- ` as those above, or is indented otherwise"
         return "this line is indented otherwise than those above"

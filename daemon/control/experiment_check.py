@@ -133,7 +133,7 @@ def _beyond_own_limits(file: ExperimentFile, step: Step, turn: Turn | None, cap:
     if needs.angle_rad >= limits.angle_rad:
         asks = f"{step.do} asks for {needs.angle_rad:g} rad, and its limit is {limits.angle_rad:g} rad"
         if isinstance(step, TwistStep) and may_be_decimals(step.angles_rad):
-            yield f"{asks}; {DECIMAL_POINT}, or raise limits.angle_rad"
+            yield f"{asks}; {DECIMAL_POINT}; or raise limits.angle_rad"
         else:
             yield f"{asks}; raise limits.angle_rad, or ask for less"
     if step.timeout_s is not None and needs.stands_s >= step.timeout_s:

@@ -794,7 +794,7 @@ def test_a_broken_robot_library_is_one_sentence(config, command, monkeypatch, tm
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_another_version_of_the_robot_library_is_one_sentence(config, command, monkeypatch, mistake):
     """The script on the robot speaks the protocol of one version."""
-    monkeypatch.setattr("shearloop.drivers.ur.script.version", lambda _name: "1.7.0")
+    monkeypatch.setattr("shearloop.drivers.ur.library.version", lambda _name: "1.7.0")
     said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the installed ur-rtde is of version 1.7.0" in said
     assert said.endswith("-m pip install ur-rtde==1.6.5`\n")
@@ -802,7 +802,7 @@ def test_another_version_of_the_robot_library_is_one_sentence(config, command, m
 
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_a_missing_robot_library_is_one_sentence(config, command, monkeypatch, mistake):
-    monkeypatch.setattr("shearloop.drivers.ur.client.find_spec", lambda _name: None)
+    monkeypatch.setattr("shearloop.drivers.ur.library.find_spec", lambda _name: None)
     said = mistake(command, str(config(robot=str(Path("config/ur.yaml").resolve()))))
     assert "the robot needs the package ur-rtde, which is not installed for Python 3." in said
     assert "-m pip install ur-rtde" in said

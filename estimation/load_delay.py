@@ -9,7 +9,7 @@ second). Emulated rigs without the filter give −0.08 to 0.05 s.
 """
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.left_out import left_out_blocks
 from shearloop.estimation.series import FrameSeries, check_finite
+from shearloop.estimation.twists import find_twists
 from shearloop.estimation.validator_fit import channel_noise
 from shearloop.estimation.values import TWO_SIDED_95
 
@@ -56,6 +57,14 @@ _UNCHECKED_S = 0.75
 _BUFFERED_S = 3.0
 # A larger standard error leaves the times open within its 95 % interval; recorded twists have 0.02 to 0.06 s.
 _LARGE_ERROR_S = 0.1
+# A clock that was set forward leaves a gap that is this much longer than a period, in s; this many gaps are tried.
+_GAP_S, _GAPS = 0.3, 5
+# How much faster than the frames' clock the load cell's may run. A microcontroller's resonator is off by up to 0.5 %.
+_RATES = np.round(np.concatenate([np.arange(-0.02, 0.0, 0.001), np.arange(0.001, 0.0201, 0.001)]), 3)
+# Without the fault, the delay explains this factor more. With fewer changes of load chance does.
+_FAULT_PROMINENCE, _MIN_CHANGES = 1.15, 4
+# The changes of load that show a delay in a fingertip that the tool moves.
+MANY_CHANGES = 10
 # Readings per stretch for the load cell's noise, and the least number of stretches.
 _NOISE_READINGS, _MIN_QUIET = 64, 4
 
@@ -94,6 +103,16 @@ class LoadTiming:
     uncertainty_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ClockFault:
+    """What one clock did against the other one, the cure, and the times (p,) of the load cell's readings without it."""
+
+    text: str
+    cure: str
+    torque_t_s: FloatArray
+    is_jump: bool = False
+
+
 TRUSTED = LoadTiming()
 
 
@@ -112,6 +131,12 @@ def measure_timing(recordings: Sequence[FrameSeries], others: Sequence[FrameSeri
     ]
     if all(delay is None or delay.few_frames for _, delay in timed):
         timed = _sure_delays(others) or timed
+    unseen = [] if any(delay for _, delay in timed) else [(other, None) for other in others]
+    for recording, delay in [*timed, *unseen]:
+        if (fault := find_clock_fault(recording, delay)) is not None:
+            raise CalibrationError(
+                f"{fault.text}: a calibration would learn the torque of another moment; {fault.cure}"
+            )
     sure = [None if delay is None or delay.few_frames else delay for _, delay in timed]
     for (recording, _), delay in zip(timed, sure, strict=True):
         if delay is not None and delay.late_s:
@@ -176,8 +201,82 @@ def load_delay_warning(series: FrameSeries) -> str:
         return series.load_doubt
 
 
+def count_load_changes(series: FrameSeries) -> int:
+    """Return how many times the load came and went within the frames."""
+    return len(find_twists(np.nan_to_num(series.torque_at_frames())))
+
+
+def find_clock_fault(series: FrameSeries, found: LoadDelay | None) -> ClockFault | None:
+    """Return the jump or the wrong rate of the load cell's clock that hides the delay of raw frames, None without one.
+
+    `found` is the delay without a fault, by `find_load_delay`. Once the fault is taken out of the times, a delay stands
+    out. Frames that no grip can be found in, as of a dead board, show none. It takes up to a second.
+    """
+    if found is not None and found.error_s <= _LARGE_ERROR_S and not found.late_s:
+        return None
+    if not np.isfinite(series.channels).all() or count_load_changes(series) < _MIN_CHANGES:
+        return None
+    moves = _moves_in_grip(series)
+    best, most = None, _FAULT_PROMINENCE * _most_explained(series, moves)
+    for fault in _possible_faults(series):
+        timed = replace(series, torque_t_s=fault.torque_t_s)
+        # A wrong rate hardly moves the grip that the load shows. A jump may.
+        explained = _most_explained(timed, _moves_in_grip(timed) if fault.is_jump else moves)
+        if explained > most:
+            best, most = fault, explained
+    if best is None:
+        return None
+    timed = replace(series, torque_t_s=best.torque_t_s)
+    delay = _delay_of(timed, segment_grip(timed)[1])
+    return best if delay is not None and delay.error_s <= _LARGE_ERROR_S else None
+
+
+def _moves_in_grip(series: FrameSeries) -> list[tuple[FloatArray, FloatArray, float]]:
+    """Return the frames' moves in the grip by side, as `_moves` does; none without a grip of enough frames."""
+    try:
+        part = segment_grip(series)[1]
+    except CalibrationError:
+        return []
+    if len(series.t_s[part]) < _SURE_FRAMES:
+        return []
+    return [_moves(series.t_s[part], series.channels[part, layer]) for layer in range(len(series.sides))]
+
+
+def _most_explained(series: FrameSeries, moves: Sequence[tuple[FloatArray, FloatArray, float]]) -> float:
+    """Return the largest fraction of the load's changes that the moves of a side explain at any delay."""
+    found = 0.0
+    for of_side in moves:
+        total, rest = _squares(series, *of_side, _SHIFTS_S[::2])
+        found = max(found, float(_explained(total.sum(axis=0), rest.sum(axis=0)).max()))
+    return found
+
+
+def _possible_faults(series: FrameSeries) -> Iterator[ClockFault]:
+    """Yield what the clocks may have done: one was set forward at a gap of its times, or they ran at two rates."""
+    times_s = series.torque_t_s
+    cure = "use the part before or after that (--time-range), or record again with one clock for both"
+    for whose, own_s, sign in (("the load cell's", times_s, -1.0), ("the frames'", series.t_s, 1.0)):
+        steps_s = np.diff(own_s)
+        period_s = float(np.median(steps_s))
+        gaps = np.flatnonzero(steps_s > period_s + _GAP_S)
+        for gap in gaps[np.argsort(steps_s[gaps])[::-1][:_GAPS]].tolist():
+            jump_s, after_s = float(steps_s[gap]) - period_s, float(own_s[gap] - series.t_s[0])
+            text = f"{whose} clock was set forward by {jump_s:.1f} s, {after_s:.0f} s after the first frame"
+            moved_s = np.where(times_s > own_s[gap], times_s + sign * jump_s, times_s)
+            yield ClockFault(text, cure, moved_s, is_jump=True)
+    for rate in _RATES.tolist():
+        yield ClockFault(
+            f"the load cell's times run {abs(rate):.1%} too {'fast' if rate > 0 else 'slow'} for the frames'",
+            "its clock has another rate, or was set on the way, and no delay corrects that: record again with one "
+            "clock for both",
+            times_s[0] + (times_s - times_s[0]) / (1.0 + rate),
+        )
+
+
 def _doubt(series: FrameSeries, found: LoadDelay | None) -> str:
     """Return why a delay is unusual. With few gripped frames it can be chance: a warning and not a refusal."""
+    if (fault := find_clock_fault(series, found)) is not None:
+        return f"{fault.text}; {fault.cure}"
     if found is None or (found.few_frames and found.explained < _WARN_EXPLAINED):
         return series.load_doubt
     if not found.late_s:
@@ -261,8 +360,7 @@ def is_filtered(torque_nm: FloatArray) -> bool | None:
 
 def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | None:
     moves, middles, span_s = _moves(series.t_s[part], series.channels[part, layer])
-    changes = np.array([_changes(series, middles + delay, span_s) for delay in _SHIFTS_S]).T
-    total, rest = changes**2, _cross_validated_residual(moves, changes) ** 2
+    total, rest = _squares(series, moves, middles, span_s, _SHIFTS_S)
     explained = _explained(total.sum(axis=0), rest.sum(axis=0))
     best = int(np.argmax(explained))
     others = explained[np.abs(_SHIFTS_S - _SHIFTS_S[best]) > _APART_S]
@@ -276,6 +374,14 @@ def _delay_of_side(series: FrameSeries, part: slice, layer: int) -> LoadDelay | 
     # Half of the central two thirds: a few draws find another peak.
     error_s = float(np.diff(np.quantile(peaks, [0.16, 0.84]))[0]) / 2
     return LoadDelay(_peak(shifts_s, explained[near]), error_s, float(explained[best]))
+
+
+def _squares(
+    series: FrameSeries, moves: FloatArray, middles: FloatArray, span_s: float, shifts_s: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the squares (n, s) of the load's changes at (s,) shifts, and of what the frames' moves do not explain."""
+    changes = np.array([_changes(series, middles + shift_s, span_s) for shift_s in shifts_s]).T
+    return changes**2, _cross_validated_residual(moves, changes) ** 2
 
 
 def _peak(shifts_s: FloatArray, explained: FloatArray) -> float:

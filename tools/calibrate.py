@@ -15,6 +15,7 @@ from shearloop.estimation.bank_match import find_numberings
 from shearloop.estimation.estimator_names import EstimatorName
 from shearloop.estimation.gain_correction import GainCorrection
 from shearloop.estimation.interval_regressor import IntervalRegressor
+from shearloop.estimation.load_delay import MANY_CHANGES, count_load_changes
 from shearloop.estimation.series import distinct
 from shearloop.estimation.values import Measured
 from shearloop.tools.frame_series import (
@@ -56,6 +57,16 @@ class CalibrationResult:
     def all_frames(self) -> int:
         """The frames of the parts, also those without a known torque or diameter."""
         return sum(len(part.t_s) for part in self.parts)
+
+    @property
+    def load_changes(self) -> int:
+        """How many times the load came and went."""
+        return sum(count_load_changes(part) for part in self.parts)
+
+    @property
+    def changes_often(self) -> bool:
+        """Whether the load changes often enough to show its delay."""
+        return self.load_changes >= MANY_CHANGES
 
     @property
     def tool_mm(self) -> float | None:

@@ -237,14 +237,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
     sentences += [f"Warning: {doubt}." for doubt in result.doubts]
     sentences += [f"Left out: {omission}." for omission in (*result.left_out, *result.of_other_tools)]
     if result.widening is not None:
-        effect = "and the intervals of loaded frames do not allow for it"
-        if result.widening > 1.0:
-            effect = f"so the intervals of loaded frames are {result.widening:.2g} times wider"
-        sentences.append(
-            "Could not verify the load cell's timestamps: the load changed too few times. They may be "
-            f"{timing.uncertainty_s:.2g} s off, {effect}. Record more changes of load, such as ten twists, or confirm "
-            "the load cell's clock with --load-cell-delay-s 0."
-        )
+        sentences.append(_unverified(result, result.widening))
     if result.tool_mm is not None:
         sentences.append(f"The tool's diameter is {result.tool_mm:.3g} mm.")
     elif (law := calibration.tools) is not None:
@@ -262,6 +255,25 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
         unnamed = "The recordings do not name one tool's diameter, and on another tool the torque would be wrong"
         sentences.append(f"{unnamed}: name it with --tool-mm.")
     return sentences
+
+
+def _unverified(result: "CalibrationResult", widening: float) -> str:
+    """Return that the load cell's times are not verified, why, what that costs, and the cure."""
+    effect = "and the intervals of loaded frames do not allow for it"
+    if widening > 1.0:
+        effect = f"so the intervals of loaded frames are {widening:.2g} times wider"
+    off = f"They may be {result.timing.uncertainty_s:.2g} s off, {effect}."
+    unverified = "Could not verify the load cell's timestamps: the load changed"
+    if not result.changes_often:
+        return (
+            f"{unverified} too few times. {off} Record more changes of load, such as ten twists, or confirm the load "
+            "cell's clock with --load-cell-delay-s 0."
+        )
+    return (
+        f"{unverified} {result.load_changes} times, and no one delay explains how the frames moved. {off} Either the "
+        "clocks of the load cell and the frames do not agree, or the tool hardly moves the gel: stamp both with one "
+        "clock, and record both fingertips."
+    )
 
 
 def _misses_loads(regressor: "IntervalRegressor", calibration: "Calibration") -> str:

@@ -1,5 +1,6 @@
 """Torques that are stamped at other times than the frames: measured by how single frames move as the load changes."""
 
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -12,6 +13,7 @@ from shearloop.estimation.grips import segment_grip
 from shearloop.estimation.interval_fit import student_inflation
 from shearloop.estimation.load_delay import (
     LoadDelay,
+    find_clock_fault,
     find_load_delay,
     is_filtered,
     load_delay_warning,
@@ -79,14 +81,15 @@ def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
         measure_timing([late])
 
 
-def test_no_delay_is_advised_where_the_recordings_computer_was_too_busy(recorded):
+def test_no_delay_is_advised_where_the_recordings_computer_was_too_busy(recorded, monkeypatch):
     late = replace(recorded, torque_t_s=recorded.torque_t_s - 2.0)
     with pytest.raises(CalibrationError, match=r"calibrate with --load-cell-delay-s -2\.0\d"):
         measure_timing([late])
     # Frames that waited come in bursts.
     t_s = late.t_s.copy()
     t_s[2::20] = t_s[1::20][: len(t_s[2::20])] + 0.01
-    # A clock that jumps on the way.
+    # A clock that jumps on the way; as with few changes of load, it is not named.
+    monkeypatch.setattr(load_delay, "find_clock_fault", lambda *_: None)
     times_s = recorded.torque_t_s
     jumped = replace(recorded, torque_t_s=np.where(times_s < np.quantile(times_s, 0.55), times_s - 2.0, times_s - 1.0))
     for busy, why in ((replace(late, t_s=t_s), "came in bursts"), (jumped, "its halves show other delays")):
@@ -94,6 +97,50 @@ def test_no_delay_is_advised_where_the_recordings_computer_was_too_busy(recorded
             measure_timing([busy])
         assert "--load-cell-delay-s" not in str(refused.value)
         assert "--load-cell-delay-s" not in load_delay_warning(busy)
+
+
+def set_forward(series, jump_s):
+    times_s = series.torque_t_s
+    return replace(series, torque_t_s=np.where(times_s < np.quantile(times_s, 0.55), times_s, times_s + jump_s))
+
+
+def frames_set_forward(series, jump_s):
+    t_s = series.t_s
+    return replace(series, t_s=np.where(t_s < np.quantile(t_s, 0.45), t_s, t_s + jump_s))
+
+
+def at_rate(series, rate):
+    return replace(series, torque_t_s=series.torque_t_s * (1.0 + rate))
+
+
+@pytest.mark.parametrize(
+    ("changed", "by", "cause"),
+    [
+        (set_forward, 0.7, r"the load cell's clock was set forward by 0\.7 s, \d+ s after the first frame"),
+        (set_forward, 3.0, r"the load cell's clock was set forward by 3\.0 s, \d+ s after the first frame"),
+        (frames_set_forward, 3.0, r"the frames' clock was set forward by 3\.0 s, \d+ s after the first frame"),
+        (at_rate, 0.01, r"the load cell's times run 1\.0% too fast for the frames'"),
+        (at_rate, -0.02, r"the load cell's times run 2\.0% too slow for the frames'"),
+    ],
+)
+def test_a_clock_that_jumped_or_ran_at_another_rate_is_named_and_refused(recorded, changed, by, cause):
+    wrong = changed(recorded, by)
+    with pytest.raises(CalibrationError, match=f"^{cause}: a calibration would learn.*record again") as refused:
+        measure_timing([wrong])
+    assert "--load-cell-delay-s" not in str(refused.value)
+    assert re.match(f"{cause}; ", load_delay_warning(wrong))
+    # The other fingertip shows it too.
+    with pytest.raises(CalibrationError, match=cause):
+        measure_timing([replace(unmoved(wrong), sides=wrong.sides)], [wrong])
+
+
+def test_readings_that_are_missing_are_no_clock_that_was_set_forward(recorded):
+    times_s = recorded.torque_t_s
+    kept = (times_s < np.quantile(times_s, 0.5)) | (times_s > np.quantile(times_s, 0.53))
+    lost = replace(recorded, torque_t_s=times_s[kept], torque_nm=recorded.torque_nm[kept])
+    assert measure_timing([lost]).uncertainty_s == 0.0
+    assert find_clock_fault(lost, None) is None
+    assert find_clock_fault(unmoved(lost), None) is None
 
 
 def test_no_delay_is_advised_on_a_quiet_part_of_a_recording_whose_computer_was_too_busy(recorded):

@@ -27,7 +27,7 @@ from shearloop.drivers.eit_kit import ADC_REFERENCE_V
 from shearloop.drivers.frame_clock import slope_below
 from shearloop.errors import UserError
 from shearloop.estimation import FrameSeries
-from shearloop.estimation.load_delay import measured_delay
+from shearloop.estimation.load_delay import find_clock_fault, measured_delay
 from shearloop.estimation.values import longest_load_gap_s
 from shearloop.files import open_file
 from shearloop.tools.recordings.load_values import rounding_step_nm, valid_load
@@ -337,12 +337,18 @@ def import_mat(sources: Sequence[Path], out: Path, time_format: str = DATENUM) -
     if left_out:
         notes[LEFT_OUT_NOTE] = "; ".join(left_out)
     remarks += _rounded_load(load.values[:, 0])
-    remarks += _missing_load(load.unix_s)
     arrivals = {side: [round(float(unix_s) * 1e9) for unix_s in stream.unix_s] for side, stream in streams.items()}
     middles = {side: frame_middles(arrivals_ns) for side, arrivals_ns in arrivals.items()}
-    remarks += [_missing(side, arrivals_ns) for side, arrivals_ns in arrivals.items() if pauses(arrivals_ns)]
-    delay = measured_delay([_series_of_side(side, stream, middles[side], load) for side, stream in streams.items()])
-    if delay is not None and delay.late_s:
+    all_series = [_series_of_side(side, stream, middles[side], load) for side, stream in streams.items()]
+    delay = measured_delay(all_series)
+    faults = (find_clock_fault(series, delay) for series in all_series)
+    fault = next((one for one in faults if one is not None), None)
+    if fault is None or not fault.is_jump:
+        remarks += _missing_load(load.unix_s, max(float(stream.unix_s.max()) for stream in streams.values()))
+        remarks += [_missing(side, arrivals_ns) for side, arrivals_ns in arrivals.items() if pauses(arrivals_ns)]
+    if fault is not None:
+        remarks.append(f"Warning: {fault.text}; {fault.cure}.")
+    elif delay is not None and delay.late_s:
         load = replace(load, unix_s=load.unix_s - delay.late_s)
         remarks.append(
             f"The load was stamped {delay.late_s:.2f} ± {delay.error_s:.2f} s too late against the gel's motion, "
@@ -480,13 +486,21 @@ def _missing(side: str, arrivals_ns: Sequence[int]) -> str:
     )
 
 
-def _missing_load(stamps_s: FloatArray) -> Iterator[str]:
-    """Yield the remark on load values that are missing, where there is one."""
+def _missing_load(stamps_s: FloatArray, last_frame_s: float) -> Iterator[str]:
+    """Yield the remark on load values that are missing, where there is one, or that come after the last frame."""
     pauses_s = np.diff(stamps_s)
-    pauses_s = pauses_s[pauses_s > longest_load_gap_s(stamps_s)]
-    if len(pauses_s):
+    at = np.flatnonzero(pauses_s > longest_load_gap_s(stamps_s))
+    after_last = [one for one in at.tolist() if stamps_s[one + 1] > last_frame_s]
+    if after_last:
+        first, at = after_last[0], at[: -len(after_last)]
         yield (
-            f"Load values are missing in {counted(len(pauses_s), 'place')}, for up to {pauses_s.max():.1f} s: frames "
+            f"Warning: the last {len(stamps_s) - first - 1} of {counted(len(stamps_s), 'load value')} are after the "
+            f"last frame, from a step of {pauses_s[first]:.1f} s in their times on: if the load cell measured all the "
+            "time, its clock was set forward by that step. Correct the times, or record again with one clock for both."
+        )
+    if len(at):
+        yield (
+            f"Load values are missing in {counted(len(at), 'place')}, for up to {pauses_s[at].max():.1f} s: frames "
             "there have no torque."
         )
 

@@ -601,6 +601,18 @@ def test_streams_of_two_recordings_are_refused(moved, mat_folder, tmp_path):
         import_mat([*sources, other / moved], tmp_path / "a.mcap")
 
 
+def test_a_clock_that_was_set_forward_beyond_the_last_frame_is_no_gap(mat_folder, tmp_path):
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[200:, 0] += 3600 / 86400
+    savemat(folder / "load.mat", {"Load_Data": load})
+    remarks = " ".join(import_mat([folder], tmp_path / "a.mcap").remarks)
+    said = "the last 155 of 355 load values are after the last frame, from a step of 3600.1 s in their times on"
+    assert said in remarks
+    assert "its clock was set forward" in remarks
+    assert "missing" not in remarks
+
+
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 def test_a_refused_import_leaves_no_file(mat_folder, small_disk):
     with pytest.raises(UserError, match="No space left on device"):

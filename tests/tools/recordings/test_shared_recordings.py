@@ -19,7 +19,7 @@ from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation import TRUSTED, Calibration, FrameSeries, fit, measure_timing
 from shearloop.estimation.estimator_names import EstimatorName
-from shearloop.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
+from shearloop.estimation.load_delay import find_clock_fault, find_load_delay, is_filtered, load_delay_warning
 from shearloop.studies.charts.fault_sweeps import balanced, judge_level
 from shearloop.studies.charts.stability import select_rows
 from shearloop.studies.slices.calibration import SliceCalibration
@@ -359,6 +359,49 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     printed = result_of("calibrate", twists_file, "--sides", "left", "--out", tmp_path / "a.cal")
     assert printed["timing_uncertainty_s"] == 0
     assert printed["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        (lambda t_s: t_s + 3.0 * (t_s > t_s.mean()), r"the load cell's clock was set forward by 3\.0 s, 2\d\d s after"),
+        (lambda t_s: t_s[0] + 1.01 * (t_s - t_s[0]), r"the load cell's times run 1\.0% too fast"),
+        (lambda t_s: t_s[0] + 1.002 * (t_s - t_s[0]), r"the load cell's times run 0\.2% too fast"),
+    ],
+)
+def test_a_load_cells_clock_that_jumped_or_ran_fast_is_named(changed, cause, shared, tmp_path, mistake):
+    sources = [shared / "recordings/streams/2024-12-03_16-09" / f"device{n}.mat" for n in (1, 2, 3)]
+    load = read_stream(sources[2], "load")
+    table = np.column_stack([changed(load.unix_s) / 86400 + 719529, load.values])
+    savemat(tmp_path / "load.mat", {"Load_Data": table})
+    imported = import_mat([*sources[:2], tmp_path / "load.mat"], tmp_path / "a.mcap")
+    (remark,) = imported.remarks
+    assert re.match(f"Warning: {cause}", remark)
+    said = mistake("calibrate", tmp_path / "a.mcap", "--out", tmp_path / "a.cal")
+    assert re.search(cause, said)
+    assert "--load-cell-delay-s" not in said
+    assert "too few times" not in said
+
+
+def test_no_clock_of_a_real_recording_is_blamed(twists, cylinders, stream):
+    whole = [twists, *cylinders.values(), stream("20241202_153632"), stream("20241202_171704")]
+    parts = [part_of(twists, *part) for part in ((0, 0.457), (0.1, 0.6), (0.3, 0.8), (0.5, 1))]
+    for series in whole + parts:
+        for side in series.sides:
+            one = series.select_sides((side,))
+            assert find_clock_fault(one, find_load_delay(one)) is None
+
+
+@pytest.mark.usefixtures("unjudged")
+def test_a_load_that_changed_often_is_not_said_to_have_changed_too_few_times(shared, tmp_path, ran):
+    """The left fingertip alone hardly moves."""
+    folder = shared / "recordings/streams/2024-12-03_16-09"
+    import_mat([folder / "device2.mat", folder / "device3.mat"], tmp_path / "a.mcap")
+    printed = ran("calibrate", tmp_path / "a.mcap", "--out", tmp_path / "a.cal").out
+    assert (
+        "Could not verify the load cell's timestamps: the load changed 10 times, and no one delay explains" in printed
+    )
+    assert "--load-cell-delay-s" not in printed
 
 
 @pytest.mark.parametrize("name", ["20241202_171704", "glitch_20241202_173837"])

@@ -26,6 +26,16 @@ def test_a_value_beyond_a_limit_does_not_read_as_the_limit(value, limit, sign, t
     assert beyond(value, limit, 1, sign) == text
 
 
+def test_a_number_is_left_out_of_its_word_alone():
+    """A bracket went with its number, and a gap that a number leaves made no count at all."""
+    reasons = CountedReasons()
+    for number in ("0.3", "12.5", "7.0"):
+        reasons.add(f"it rose by +{number} N·m (limit {number}), in 2 steps")
+    reasons.add("a  gap")
+    reasons.add("a 7 gap")
+    assert reasons.most_frequent_first == [(3, "it rose by +… N·m (limit …), in 2 steps"), (2, "a … gap")]
+
+
 def test_reasons_that_count_up_are_one_without_the_count():
     """27 torques were "taking the idle frame, 10 of 10"."""
     reasons = CountedReasons()

@@ -1,6 +1,9 @@
 """Numbers and values in words and in digits, and sentences that differ in their numbers alone."""
 
+import re
+
 LONGEST_VALUE = 60
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 def times(count: int) -> str:
@@ -47,8 +50,10 @@ class CountedReasons:
         """Count a reason."""
         kind = without_digits(reason)
         count, before = self._counts.get(kind, (0, reason))
-        words = zip(before.split(), reason.split(), strict=True)
-        self._counts[kind] = count + 1, " ".join(word if word == other else "…" for word, other in words)
+        # Both have the same blanks, because they have the same kind.
+        words = zip(before.split(" "), reason.split(" "), strict=True)
+        shared = " ".join(word if word == other else _NUMBER.sub("…", other) for word, other in words)
+        self._counts[kind] = count + 1, shared
 
     @property
     def total(self) -> int:

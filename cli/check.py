@@ -145,7 +145,7 @@ def _check_experiment(path: Path, rig: Path | None) -> "Parts":
 def _check_named_files(path: Path, parts: "Parts", experiment: Path | None = None) -> None:
     """Add the mistakes in the files that an invalid configuration names, or of another `experiment`."""
     from shearloop.daemon.rig import robot_settings
-    from shearloop.tools.check import read_experiment
+    from shearloop.tools.check import named_file, read_experiment
     from shearloop.yaml_files import read_yaml
 
     content: object = None
@@ -153,15 +153,9 @@ def _check_named_files(path: Path, parts: "Parts", experiment: Path | None = Non
         # This mistake is named already.
         content = read_yaml(path, UserError)
     given = content if isinstance(content, dict) else {}
-    named = {key: path.parent / given[key] for key in ("robot", "experiment") if _is_path(given.get(key))}
-    if experiment is not None:
-        named["experiment"] = experiment
-    for key, read in (("robot", robot_settings), ("experiment", read_experiment)):
-        if key in named:
+    folder = path.resolve().parent
+    robot, own = (named_file(given.get(key), folder) for key in ("robot", "experiment"))
+    for key, file, read in (("robot", robot, robot_settings), ("experiment", experiment or own, read_experiment)):
+        if file is not None:
             with parts.of(key):
-                read(named[key])
-
-
-def _is_path(value: object) -> bool:
-    """Return whether a value of a file can be the path of one."""
-    return isinstance(value, str) and bool(value.strip(" ."))
+                read(file)

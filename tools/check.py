@@ -10,8 +10,12 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pydantic import ValidationError
+
+from shearloop.daemon.config_file import ConfigModel
 from shearloop.daemon.errors import USER_ERRORS
 from shearloop.errors import Hint, UserError
+from shearloop.models import as_model
 from shearloop.words import counted
 
 if TYPE_CHECKING:
@@ -57,6 +61,17 @@ class Parts:
             yield
         except USER_ERRORS as error:
             self.mistakes[name] = str(error)
+
+
+class _NamedFile(ConfigModel):
+    path: Path
+
+
+def named_file(value: object, folder: Path) -> Path | None:
+    """Return the file that a value of a configuration in `folder` names, None for a value that names none."""
+    with suppress(ValidationError):
+        return as_model({"path": value}, _NamedFile, folder).path
+    return None
 
 
 def check_parts(config: "DaemonConfig", path: Path, check_emulators: CheckEmulators) -> Parts:

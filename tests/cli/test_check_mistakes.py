@@ -113,6 +113,23 @@ def test_mistakes_in_three_files_are_shown_together(arguments, said_of):
     assert places == [("rig.yaml", "loop.kp"), ("ur.yaml", "limits.joints.margin_rad"), ("e.yaml", "steps[4].wait_s")]
 
 
+def test_the_files_of_an_invalid_rig_are_found_as_the_rig_names_them(said_of, tmp_path, monkeypatch):
+    """They were sought under `~` and `$BENCH` beside the rig, and named as missing."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("BENCH", str(tmp_path))
+    rig = replaced(f"{RIG}loop: {{kp: a}}\nexperiment: $BENCH/e.yaml\n", "robot: ur.yaml", "robot: ~/ur.yaml")
+    assert said_of("rig.yaml", rig=rig).splitlines()[1:] == []
+    wrong = replaced(EXPERIMENT, "wait_s: 3", "wait_s: x")
+    assert f"{tmp_path}/e.yaml:10: steps[4].wait_s: " in said_of("rig.yaml", rig=rig, experiment=wrong)
+
+
+@pytest.mark.parametrize("robot", ["~nobody-of-this-name/ur.yaml", "$NOT_SET_HERE/ur.yaml", '"a\\0b"', '"."', "5"])
+def test_a_path_that_names_no_file_is_one_mistake(robot, said_of):
+    said = said_of("rig.yaml", rig=replaced(RIG, "robot: ur.yaml", f"robot: {robot}"))
+    assert "rig.yaml:3: robot: " in said
+    assert said.splitlines()[1:] == []
+
+
 NO_BREAK, IDEOGRAPHIC = "\N{NO-BREAK SPACE}", "\N{IDEOGRAPHIC SPACE}"
 NO_WIDTH, BYTE_ORDER = "\N{ZERO WIDTH SPACE}", "\N{ZERO WIDTH NO-BREAK SPACE}"
 

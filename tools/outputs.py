@@ -78,8 +78,11 @@ def check_place(out: Path) -> None:
         raise UserError(f"{out} is a folder; give the name of a file in it")
     if not os.path.isdir(out.parent):
         raise UserError(f"{out}: there is no folder {out.parent}; make it, or choose another path")
-    if not os.path.lexists(out) and not os.access(out.parent, os.W_OK | os.X_OK):
-        raise UserError(f"{out}: you may not write in the folder {out.parent}; choose another path")
+    if os.path.isfile(out) or not os.path.lexists(out):
+        # A new file replaces the one that is there, over a link too.
+        folder = os.path.dirname(os.path.realpath(out))
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise UserError(f"{out}: you may not write in the folder {folder}; choose another path")
 
 
 def check_overwrite(out: Path, kind: str, begins: bytes | re.Pattern[bytes] | None = None) -> None:

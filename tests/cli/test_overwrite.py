@@ -17,7 +17,7 @@ from shearloop.cli.options import path_of
 from shearloop.cli.output_paths import output_path
 from shearloop.errors import UserError
 from shearloop.tools.commission.report import earlier_report
-from shearloop.tools.outputs import YAML_KEYS, check_overwrite
+from shearloop.tools.outputs import YAML_KEYS, check_overwrite, check_place
 from shearloop.tools.recordings.tables import RecordedTopics
 
 MCAP = b"\x89MCAP0\r\n and what cannot be recorded again"
@@ -77,6 +77,21 @@ def test_no_command_begins_with_a_place_where_it_can_write_no_file(
         said = "no.mcap"
     assert said in mistake(*command.format(bank=BANK).split(), tmp_path / out)
     assert {one.name for one in tmp_path.iterdir()} == {"file", "folder.png"}
+
+
+def test_a_file_that_cannot_be_replaced_in_its_folder_is_refused_before_the_work(tmp_path, monkeypatch, mistake):
+    """A new file replaces it, so that the right to write the folder decides; over a link, that of the file's folder."""
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    calibration, link = locked / "load.yaml", tmp_path / "link.yaml"
+    calibration.write_text("a: 1\n")
+    link.symlink_to(calibration)
+    monkeypatch.setattr("os.access", lambda path, _: Path(path) != locked)
+    for out in (calibration, link):
+        said = mistake(*["calibrate", "load", "--mass-g", "100", "--lever-arm-mm", "35", "--port", "no", "--out"], out)
+        assert f"{out}: you may not write in the folder {locked}" in said
+    # What is no file is written to, and not replaced.
+    check_place(Path(os.devnull))
 
 
 @pytest.mark.parametrize(

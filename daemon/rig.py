@@ -295,14 +295,15 @@ class Rig:
                 "something was stopped or run"
             )
             raise QuestionChangedError(f"{path}: {changed}; look at the plan again", question)
-        if (reason := deadline.why_passed("reading its file", _SLOW_FILE)) is not None:
+        if (reason := deadline.why_passed("reading its file", _SLOW_FILE, self.runner.stood_s())) is not None:
             return reason
         # A stop since the request is the runner's to answer.
         stopped = self.runner.stop_count != stops_before
         if not stopped and (reason := self.runner.refusal_of(experiment.file, confirmed=confirmed)) is not None:
             return reason
         try:
-            reason = await self.memory.begins(experiment.file.name) or deadline.why_passed("keeping the rig's state")
+            reason = await self.memory.begins(experiment.file.name)
+            reason = reason or deadline.why_passed("keeping the rig's state", stood_s=self.runner.stood_s())
             if reason is None:
                 reason = await self.runner.start(experiment.file, stops_before, deadline, confirmed=confirmed)
         finally:

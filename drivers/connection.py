@@ -31,6 +31,8 @@ READS_PER_TURN = 8
 SHORT_READ_BYTES = 4_000
 WRITE_TIMEOUT_S, WRITE_PAUSE_S = 1.0, 0.01
 CONNECT_TIMEOUT_S = 2.0
+# A deadline that passed by more is one that this process slept through.
+STOOD_STILL_S = 0.1
 # A reader that waits looks at its port at this interval. If it has not found the port empty for longer than `AWAY_NS`,
 # something kept it from reading, and what it finds may have waited. So may what the kernel delivers within that time
 # afterwards.
@@ -233,14 +235,17 @@ class TcpPort:
 
     async def read(self, timeout_s: float) -> Received | None:
         """Return arrived bytes, or None after `timeout_s`; DeviceLostError if the other side is gone."""
-        for left_s in (timeout_s, 0.0):
-            # Twice: when this process was paused, bytes may have arrived together with the deadline.
+        began_s, left_s = time.monotonic(), timeout_s
+        for _ in range(2):
+            # Twice: when this process stood still, bytes may have arrived together with the deadline.
             try:
                 async with timeout(left_s):
                     data = await self._reader.read(READ_BYTES)
                     break
             except TimeoutError:
-                continue
+                # It did not wait meanwhile, so that it waits once more.
+                stood_still = time.monotonic() - began_s > timeout_s + STOOD_STILL_S
+                left_s = timeout_s if stood_still else 0.0
             except OSError as error:
                 raise self._lost(error) from error
         else:

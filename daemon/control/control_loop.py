@@ -272,7 +272,7 @@ class ControlLoop:
             return reason
         found = detect_faults(self.inputs, self._watched, DEFAULT_LIMITS, None, self.inputs.ticked_ns)
         of_any = [fault for fault in self._lasting(found) if fault.code is not FaultCode.TORQUE_LIMIT]
-        return _refusal_by(of_any) or self._awaited_judgement()
+        return self._refusal_by(of_any, self.inputs.ticked_ns) or self._awaited_judgement()
 
     def refusal_of(
         self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False, is_enabled: bool = True
@@ -285,7 +285,8 @@ class ControlLoop:
             return reason
         found = detect_faults(self.inputs, self._watched, file.limits, None, t_ns)
         faults = found if is_enabled else self._lasting(found)
-        if reason := _refusal_by(faults) or self.operator.why_not_with_tool(file) or self._awaited_judgement():
+        reason = self._refusal_by(faults, t_ns) or self.operator.why_not_with_tool(file)
+        if reason := reason or self._awaited_judgement():
             return reason
         if not confirmed and (drops := self.operator.drop_sentence(file)):
             return f"{drops}; secure it, then confirm it with `shearloop command start --yes`"
@@ -346,7 +347,7 @@ class ControlLoop:
         if sent_rad_per_s is not None:
             self.wrist.sent(sent_rad_per_s)
         running, arm = self.running_experiment, self.inputs.arm
-        self.inputs.late_s, self.inputs.ticked_ns = late_s, t_ns
+        self.inputs.begin_tick(t_ns, late_s)
         limits = self.experiment.limits if self.experiment is not None else DEFAULT_LIMITS
         awaited = self._awaited_torques(t_ns)
         step = self._running_step(running, awaited) if running is not None else None
@@ -557,7 +558,7 @@ class ControlLoop:
             return f"the stop is acknowledged; its cause was: {acknowledged.causes}"
         return experiment.stop_reason
 
-
-def _refusal_by(faults: Sequence[Fault]) -> str | None:
-    """Return the sentences of the faults in whose presence no experiment starts, or None."""
-    return " ".join(fault.sentence for fault in faults if fault.rule.response >= Response.REFUSE_START) or None
+    def _refusal_by(self, faults: Sequence[Fault], t_ns: int) -> str | None:
+        """Return the sentences of the faults in whose presence no experiment starts, or None."""
+        refusing = [fault for fault in faults if fault.rule.response >= Response.REFUSE_START]
+        return self.inputs.why_refused(refusing, t_ns)

@@ -336,6 +336,11 @@ class Fault:
         return TABLE[self.code]
 
     @property
+    def is_old(self) -> bool:
+        """Whether only the age of the last message shows it."""
+        return self.code in (FaultCode.STATE_STALE, FaultCode.ESTIMATE_STALE) and self.t_ns is not None
+
+    @property
     def cause(self) -> str:
         """The sentence without its full stop and without the cure; a fault of the past begins with its time."""
         when = ", ".join(filter(None, (self.when, "over by now" if self.is_over else "")))

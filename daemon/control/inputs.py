@@ -2,12 +2,19 @@
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from shearloop.daemon.control.faults import Fault
+from shearloop.daemon.messaging.deadlines import stood_still
+from shearloop.daemon.messaging.messages import stale_after_s
 from shearloop.daemon.torques import TorqueSample
 from shearloop.estimation import Measured
 
+# The loop decides at least this often; a longer time is a standstill of the daemon.
+LONGEST_REST_S = stale_after_s("robot.state")
+# After a standstill, what the devices sent meanwhile has been read by then, and a fingertip has sent another frame.
+READ_WITHIN_S = 1.0
 # Torques between two ticks; more come only while the loop stands still.
 MAX_UNJUDGED = 256
 
@@ -97,6 +104,31 @@ class LatestInputs:
     ticked_ns: int = 0
     late_s: float = 0.0
     died: Mapping[str, str] = field(default_factory=dict)
+    # How long the latest standstill of the daemon was.
+    _stood_s: float = 0.0
+    # Until when what came meanwhile may be unread.
+    _unread_until_ns: int = 0
+
+    def begin_tick(self, t_ns: int, late_s: float) -> None:
+        """Note a decision, and the standstill before it."""
+        gap_s = (t_ns - self.ticked_ns) / 1e9
+        if self.ticked_ns and gap_s > LONGEST_REST_S:
+            self._stood_s, self._unread_until_ns = gap_s, t_ns + round(READ_WITHIN_S * 1e9)
+        self.ticked_ns, self.late_s = t_ns, late_s
+
+    def stood_s(self, t_ns: int) -> float:
+        """Return how long the daemon stood still, while that is why states are old, and replies late; else 0."""
+        gap_s = (t_ns - self.ticked_ns) / 1e9
+        if self.ticked_ns and gap_s > LONGEST_REST_S:
+            return gap_s
+        return self._stood_s if t_ns < self._unread_until_ns else 0.0
+
+    def why_refused(self, faults: Sequence[Fault], t_ns: int) -> str | None:
+        """Return the sentences of faults that refuse a start, or the standstill that explains all of them, or None."""
+        stood_s = self.stood_s(t_ns)
+        if faults and stood_s and all(fault.is_old for fault in faults):
+            return stood_still(stood_s)
+        return " ".join(fault.sentence for fault in faults) or None
 
     def add_torque(self, torque: TorqueSample) -> None:
         """Store a torque as the latest one of its source, and in the history unless a later measurement is there.

@@ -15,13 +15,13 @@ from shearloop.daemon.control.fault_detection import ARM_STALE_S, LONGEST_TICK_S
 from shearloop.daemon.control.faults import Fault, FaultCode
 from shearloop.daemon.control.fingers import Fingers
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.inputs import ArmStatus
+from shearloop.daemon.control.inputs import LONGEST_REST_S, ArmStatus
 from shearloop.daemon.control.operator_action import MotionPermit, OperatorAction
 from shearloop.daemon.control.state_publisher import StatePublisher
 from shearloop.daemon.control.stop_timeline import StopTimeline
 from shearloop.daemon.control.straight_moves import StraightMoves
 from shearloop.daemon.control.wrench import WrenchMean, publish_every
-from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline
+from shearloop.daemon.messaging.deadlines import NO_DEADLINE, Deadline, stood_still
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import error_text
 from shearloop.daemon.torques import WRENCH, Tareable, TorqueSample
@@ -34,8 +34,6 @@ from shearloop.timeouts import timeout
 # Without a new state the loop decides after this time, half of the time after which the arm's state is stale, while
 # something may move.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
-# While nothing moves, it decides after this time, and is late only then.
-LONGEST_REST_S = ARM_STALE_S
 # A crashed loop waits this long for the reply to its stop.
 BRAKE_S = 0.5
 # The robot confirms `Enable` in one of its next states.
@@ -183,6 +181,10 @@ class ControlLoopRunner:
         """The number of stops so far: one that comes while an experiment is read or starts ends its start."""
         return self._stop_count
 
+    def stood_s(self) -> float:
+        """Return how long the daemon has just stood still; 0 where it did not."""
+        return self._control_loop.inputs.stood_s(self._clock.now_ns())
+
     def start_refusal(self) -> str | None:
         """Return why no experiment at all can begin, or None."""
         return self.busy() or self._control_loop.start_refusal() or self._taring()
@@ -236,7 +238,7 @@ class ControlLoopRunner:
         # An arm is not enabled for an experiment that cannot begin. What refuses it may also come until it is enabled.
         refusal = self.refusal_of(file, confirmed=confirmed)
         if self._stop_count == stops_before and refusal is None:
-            refusal = await self._enable() or deadline.why_passed("enabling the arm")
+            refusal = await self._enable() or deadline.why_passed("enabling the arm", stood_s=self.stood_s())
         if self._stop_count != stops_before:
             if not self._closed:
                 self._control_loop.stop(Fault(FaultCode.OPERATOR_STOP, "a start was under way"))
@@ -328,7 +330,7 @@ class ControlLoopRunner:
             stood_s = self._stood_s
         else:
             return None
-        return f"the daemon stood still for {stood_s:.1f} s: look at the rig, and send the command again"
+        return stood_still(stood_s)
 
     def release_refusal(self) -> str | None:
         """Return why the operator cannot open the gripper now, or None.

@@ -219,8 +219,8 @@ class OperatorView:
             return None
         sensors = (source for source in self.sources.values() if not source.from_robot)
         faults = (source_fault(self.inputs, sensor, self.inputs.ticked_ns) for sensor in sensors)
-        missing = (fault for fault in faults if fault is not None and fault.code is not FaultCode.ESTIMATE_INVALID)
-        return " ".join(fault.sentence for fault in missing) or None
+        missing = [fault for fault in faults if fault is not None and fault.code is not FaultCode.ESTIMATE_INVALID]
+        return self.inputs.why_refused(missing, self.inputs.ticked_ns)
 
     def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
         """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""

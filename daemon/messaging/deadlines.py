@@ -20,6 +20,11 @@ def boot_ns() -> int:
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
 
+def stood_still(stood_s: float) -> str:
+    """Return the refusal of a command because of the daemon's own standstill."""
+    return f"the daemon stood still for {stood_s:.1f} s: look at the rig, and send the command again"
+
+
 @dataclass(frozen=True, slots=True)
 class Deadline:
     """The time until which a request may begin something, and when it came, both by `now_ns`.
@@ -31,15 +36,18 @@ class Deadline:
     came_ns: int = 0
     now_ns: Callable[[], int] = boot_ns
 
-    def why_passed(self, delay: str = "", cure: str = "") -> str | None:
+    def why_passed(self, delay: str = "", cure: str = "", stood_s: float = 0.0) -> str | None:
         """Return why it is too late to begin, or None.
 
-        `delay` names the wait since the request came in time, and `cure` says how to avoid it.
+        `delay` names the wait since the request came in time, and `cure` says how to avoid it. `stood_s`: the daemon
+        stood still for this time meanwhile.
         """
         now_ns = self.now_ns()
         late_s = (now_ns - self.until_ns) / 1e9 if self.until_ns is not None else 0.0
         if late_s <= 0.0:
             return None
+        if late_s <= stood_s:
+            return stood_still(stood_s)
         reason = f"it came {late_s:.1f} s too late to be what the operator wants now"
         if delay:
             took_s = (now_ns - self.came_ns) / 1e9

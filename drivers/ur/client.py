@@ -330,8 +330,13 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         Raises:
             RobotLostError: always, in the end.
         """
+        looked_s = time.monotonic()
         while not self._closed.is_set():
-            if time.monotonic() - self._received_s > self._timeout_s:
+            now_s = time.monotonic()
+            # While this process stood still, nobody read what the worker sent.
+            self._received_s = min(now_s, self._received_s + max(0.0, now_s - looked_s - WATCH_S))
+            looked_s = now_s
+            if now_s - self._received_s > self._timeout_s:
                 self._kill()
                 raise RobotLostError("hung", self._hung_sentence(self._timeout_s))
             with contextlib.suppress(TimeoutError):

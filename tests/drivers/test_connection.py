@@ -214,3 +214,14 @@ async def test_bytes_at_the_deadline_count():
     time.sleep(0.05)  # noqa: ASYNC251 - the pause
     reader.feed_data(b"ACT 1\n")
     assert (await receiving).data == b"ACT 1\n"
+
+
+async def test_a_reply_that_comes_after_a_pause_of_this_process_is_awaited():
+    """It gave "no whole answer within 0.5 s", although nobody had waited for it."""
+    reader = asyncio.StreamReader()
+    receiving = asyncio.create_task(TcpPort("device", reader, SimpleNamespace()).read(0.05))
+    await asyncio.sleep(0)
+    time.sleep(0.2)  # noqa: ASYNC251 - the pause
+    asyncio.get_running_loop().call_later(0.01, reader.feed_data, b"ack")
+    assert (await receiving).data == b"ack"
+    assert await TcpPort("device", reader, SimpleNamespace()).read(0.01) is None

@@ -144,6 +144,25 @@ def test_a_sensor_that_is_gone_or_silent_refuses_what_needs_torques_before_anyth
     assert loop.start(ExperimentFile(name="test", steps=steps, torque_source=drive), rig.t_ns) is None
 
 
+@pytest.mark.parametrize("stood_s", [0.12, 0.34, 0.9])
+@pytest.mark.parametrize("decided_since", [False, True])
+def test_states_that_are_old_because_the_daemon_stood_still_are_not_blamed_on_a_cable(stood_s, decided_since):
+    """It was "the robot last reported its state 0.34 s ago … check the cable"."""
+    rig = Rig(new_loop())
+    rig.run(2)
+    rig.tick += round(stood_s / TICK_S)
+    file = ExperimentFile.model_validate({"name": "test", "steps": [{"do": "release"}]})
+    if decided_since:
+        rig.silent |= {"arm", "hand"}
+        rig.step()
+    said = rig.control_loop.start(file, rig.t_ns) or ""
+    assert said == f"the daemon stood still for {stood_s:.1f} s: look at the rig, and send the command again"
+    # What is still silent a while later is.
+    rig.silent.add("arm")
+    rig.run(2)
+    assert "the robot last reported its state" in (rig.control_loop.start(file, rig.t_ns) or "")
+
+
 def pause_for(rig: Rig, seconds: float) -> None:
     assert rig.control_loop.pause() is None
     rig.run(seconds)

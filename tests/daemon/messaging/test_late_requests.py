@@ -8,6 +8,7 @@ import zmq.asyncio
 
 from shearloop.daemon.messaging import command_server
 from shearloop.daemon.messaging.command_server import CommandServer
+from shearloop.daemon.messaging.deadlines import Deadline
 from shearloop.daemon.messaging.late_requests import LONGEST_STANDSTILL_S, READ_WITHIN_S, LateRequests
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.refusals import Refusals
@@ -62,3 +63,11 @@ async def test_what_is_sent_to_a_daemon_that_stands_still_is_refused_unless_it_l
             assert carried_out or "stood still for 5.0 s" in reply["reason"]
             now_ns[0] += SECOND
             assert (await reply_to(name))["ok"], "sent again, it is carried out"
+
+
+@pytest.mark.parametrize(
+    ("stood_s", "cause"), [(0.0, "reading its file took 3.0 s"), (3.0, "the daemon stood still for 3.0 s")]
+)
+def test_a_request_that_expired_in_a_standstill_blames_no_drive(stood_s, cause):
+    deadline = Deadline(2 * 10**9, 0, lambda: 3 * 10**9)
+    assert (deadline.why_passed("reading its file", "copy the file; ", stood_s) or "").startswith(cause)

@@ -6,14 +6,16 @@ import sys
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from shearloop.drivers.ur import client
 from shearloop.drivers.ur.client import LAST_WORDS_BYTES, UrRobot, WorkerConnection
 from shearloop.drivers.ur.messages import CommandReply, Held, RobotLostError, Stop, Unlock, WristSpeed, ZeroForceTorque
 from tests import running as tasks
-from tests.drivers.ur.handler_bench import HandlerBench
+from tests.drivers.ur.handler_bench import SETTINGS, HandlerBench
 from tests.drivers.ur.robots import ROOT, running, settings_for
 from tests.fixtures.daemons import DEADLINE_S
 
@@ -238,3 +240,27 @@ async def test_a_restored_zero_that_has_ended_is_not_taken_back(play, told, tare
         robot.handle_message(0, replace(HandlerBench().state, wrench_zero=new_zero))
         robot.forget_wrench_zero()
     assert robot.wrench_zero == new_zero
+
+
+async def test_a_worker_is_not_silent_while_the_daemon_stood_still(monkeypatch):
+    """It was killed after 3 s of standstill, because it "did not answer for 2.5 s". What it had sent was unread."""
+    now_s = 100.0
+    monkeypatch.setattr(client, "time", SimpleNamespace(monotonic=lambda: now_s))
+    monkeypatch.setattr(client, "WATCH_S", 0.001)
+    monkeypatch.setattr(client, "GRACE_S", 0.0)
+    settings = replace(SETTINGS, connect_timeout_s=0.02)
+    worker = WorkerConnection(settings, UrRobot(settings))
+    monkeypatch.setattr(worker, "_kill", lambda: None)
+    looks = 0
+
+    def look() -> bool:
+        """Let 10 s pass before the second look, and then less than the interval of the looks."""
+        nonlocal looks, now_s
+        looks += 1
+        now_s += 10.0 if looks == 2 else 0.0009
+        return False
+
+    monkeypatch.setattr(worker, "_closed", SimpleNamespace(is_set=look, wait=lambda: asyncio.sleep(1)))
+    with pytest.raises(RobotLostError):
+        await worker.listen()
+    assert looks > 10, "the ten seconds were the daemon's own"

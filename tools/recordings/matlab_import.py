@@ -44,6 +44,9 @@ _LARGEST_DELAY_S = 2.0
 # Times that fall back by less are late stamps.
 _LEAST_SET_BACK_S = 0.5
 _COMPARED_ROWS = 9
+# Time zones are whole half hours apart, but for a few, and up to 26 h. The streams of one recording begin and end
+# within some seconds.
+_ZONE_S, _LARGEST_ZONE_S, _SAME_START_S = 1800.0, 26 * 3600.0, 20.0
 _LONGEST_ELAPSED_S = 31 * 86_400.0
 # Boards send a line every 0.02 to 5 s: the load cell's every 0.09 s, fingertips' every 0.54 s.
 _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
@@ -117,9 +120,10 @@ def read_stream(path: Path, name: str | None = None, time_format: str = DATENUM)
     for times that are not of this format.
     """
     table = _table(path, name)
-    _check_times(path, table[:, 0], time_format, _SHORTEST_STEP_S if name == "load" else _SHORTEST_FRAME_S)
-    if name != "load":
+    # A load may stand still, and a copy of its value changes nothing.
+    if name != "load" or (np.ptp(table[:, 1]) > 0.0 and np.median(np.diff(table[:, 0])) == 0.0):
         _check_distinct(path, table)
+    _check_times(path, table[:, 0], time_format, _SHORTEST_STEP_S if name == "load" else _SHORTEST_FRAME_S)
     return Stream(_unix_s(table[:, 0], time_format), np.ascontiguousarray(table[:, 1:]))
 
 
@@ -393,6 +397,12 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
     for earlier, later in itertools.permutations(streams, 2):
         apart_s = float(streams[later].unix_s.min() - streams[earlier].unix_s.max())
         if apart_s > _LONGEST_STEP_S:
+            if (zones_s := _zones_apart_s(streams[earlier].unix_s, streams[later].unix_s)) is not None:
+                raise UserError(
+                    f"{paths[later]} begins {_hours(zones_s)} after {paths[earlier]}, within "
+                    f"{_SAME_START_S:.0f} s, and lasts as long: their times are of two time zones; write both in one. "
+                    "If they are of two recordings, import the files of one recording at a time"
+                )
             raise UserError(
                 f"{paths[later]} begins {apart_s:.0f} s after the end of {paths[earlier]}: they are of two recordings; "
                 "import the files of one recording at a time"
@@ -403,6 +413,19 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
     for side, stream in streams.items():
         _check_volts(paths[side], stream.values)
     return load, streams, paths.get("load", files[0])
+
+
+def _zones_apart_s(earlier_s: FloatArray, later_s: FloatArray) -> float | None:
+    """Return how far two time zones are apart in which one recording has the times (n,) and (m,), None if none are."""
+    apart_s = float(later_s.min() - earlier_s.min())
+    zones_s = round(apart_s / _ZONE_S) * _ZONE_S
+    lasts_s = [float(np.ptp(times_s)) for times_s in (earlier_s, later_s)]
+    is_one = abs(apart_s - zones_s) <= _SAME_START_S and abs(lasts_s[1] - lasts_s[0]) <= 2 * _SAME_START_S
+    return zones_s if is_one and 0 < zones_s <= _LARGEST_ZONE_S else None
+
+
+def _hours(seconds: float) -> str:
+    return f"{seconds / 3600:g} h"
 
 
 def _check_volts(path: Path, lines: FloatArray) -> None:

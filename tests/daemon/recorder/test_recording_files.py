@@ -601,6 +601,29 @@ def test_streams_of_two_recordings_are_refused(moved, mat_folder, tmp_path):
         import_mat([*sources, other / moved], tmp_path / "a.mcap")
 
 
+@pytest.mark.parametrize(("hours", "named"), [(1, "1 h"), (-5.5, "5.5 h"), (9, "9 h")])
+def test_times_in_another_time_zone_are_named(hours, named, mat_folder, tmp_path):
+    folder = mat_folder()
+    load = loadmat(folder / "load.mat")["Load_Data"]
+    load[:, 0] += hours / 24
+    savemat(folder / "load.mat", {"Load_Data": load})
+    later, earlier = ("load", r"device\d") if hours > 0 else (r"device\d", "load")
+    cause = rf"{later}\.mat begins {named} after .*{earlier}\.mat, .*: their times are of two time zones; write both in"
+    with pytest.raises(UserError, match=cause):
+        import_mat([folder], tmp_path / "a.mcap")
+
+
+@pytest.mark.parametrize("name", ["device0.mat", "load.mat"])
+def test_a_file_with_each_row_twice_is_told_to_hold_copies(name, mat_folder, tmp_path):
+    folder = mat_folder()
+    ((key, rows),) = ((key, rows) for key, rows in loadmat(folder / name).items() if not key.startswith("__"))
+    savemat(folder / name, {key: np.repeat(rows, 2, axis=0)})
+    with pytest.raises(
+        UserError, match=rf"{name}: row 2 is a copy of the row above, .*{len(rows)} copies in all.*remove"
+    ):
+        import_mat([folder], tmp_path / "a.mcap")
+
+
 def test_a_clock_that_was_set_forward_beyond_the_last_frame_is_no_gap(mat_folder, tmp_path):
     folder = mat_folder()
     load = loadmat(folder / "load.mat")["Load_Data"]

@@ -136,13 +136,14 @@ class Commands:
         """Return why a stop or a pause, which can overtake an older request, ends one that lets something move."""
         if self._latest_halt is None:
             return None
-        halt, came_ns = self._latest_halt
-        if "asked_ns" not in request:
-            ago_s = (self.now_ns() - came_ns) / 1e9
-            unsure = "and without `asked_ns` nothing shows that this request was asked for later"
+        (halt, came_ns), now_ns = self._latest_halt, self.now_ns()
+        asked_ns = request.get("asked_ns")
+        if asked_ns is None or asked_ns > now_ns:
+            ago_s = (now_ns - came_ns) / 1e9
+            unsure = "and without `asked_ns` by the daemon's clock nothing shows that this request was asked for later"
             cure = f"{_LOOK_AGAIN} with it, or {_OLDEST_S:g} s after the {halt}"
             return f"a {halt} came {ago_s:.1f} s ago, {unsure}; {cure}" if ago_s <= _OLDEST_S else None
-        return f"a {halt} came after it was asked for; {_LOOK_AGAIN}" if request["asked_ns"] <= came_ns else None
+        return f"a {halt} came after it was asked for; {_LOOK_AGAIN}" if asked_ns <= came_ns else None
 
     def _is_for_this_one(self, request: Request) -> bool:
         """Return whether a request is meant for this daemon, and not for one before it."""

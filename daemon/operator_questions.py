@@ -71,7 +71,7 @@ def held_note(operator: OperatorView, file: ExperimentFile) -> str:
 
 def file_refusal(operator: OperatorView, file: ExperimentFile) -> str | None:
     """Return why this experiment cannot begin with the present tool and zeros, or None."""
-    if (reason := operator.why_not_with_tool(file)) is not None:
+    if (reason := operator.why_not_begun(file)) is not None:
         return reason
     if isinstance(file.steps[0], TareStep) and (reason := operator.why_no_tare_step()) is not None:
         return f"step 1 (tare): {reason}"

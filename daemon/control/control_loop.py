@@ -285,7 +285,7 @@ class ControlLoop:
             return reason
         found = detect_faults(self.inputs, self._watched, file.limits, None, t_ns)
         faults = found if is_enabled else self._lasting(found)
-        reason = self._refusal_by(faults, t_ns) or self.operator.why_not_with_tool(file)
+        reason = self._refusal_by(faults, t_ns) or self.operator.why_not_begun(file)
         if reason := reason or self._awaited_judgement():
             return reason
         if not confirmed and (drops := self.operator.drop_sentence(file)):

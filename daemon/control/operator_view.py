@@ -159,7 +159,7 @@ class OperatorView:
             return ""
         return f"step {number} (release) opens the gripper, and a tool in it drops; {what}"
 
-    def why_not_with_tool(self, file: ExperimentFile) -> str | None:
+    def why_not_begun(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, a silent sensor or an unknown zero forbids an experiment, or None."""
         driving = self.sources[file.torque_source]
         reason = self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_sensor(file)

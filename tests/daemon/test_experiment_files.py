@@ -284,7 +284,7 @@ def rig(folder: Path, runner: Runner, instance: str = "a1") -> Rig:
                 known_tool=lambda: AT_REST,
                 drop_sentence=lambda _: "",
                 why_no_source=lambda _: None,
-                why_not_with_tool=lambda _: None,
+                why_not_begun=lambda _: None,
             ),
         ),
         runner,

@@ -117,7 +117,7 @@ async def test_no_tool_drops_unasked(state: str, tmp_path: Path, monkeypatch: py
         await bench.prepare(state)
         for file in sequences():
             operator = bench.loop.operator
-            if operator.why_not_with_tool(file) is not None:
+            if operator.why_not_begun(file) is not None:
                 continue
             asks, before_mm = bool(operator.drop_sentence(file)), bench.rig.model.width_mm
             bench.widest_mm = before_mm

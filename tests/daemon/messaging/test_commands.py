@@ -175,7 +175,10 @@ async def test_a_stop_ends_every_request_that_was_asked_for_before_it(name):
     of_now = meant_for(await handlers[STATUS]({}), 0.05, 2.0)
     assert await refusal(of_now) != stopped_before
     undated = {key: of_now[key] for key in ("instance", "until_ns")}
-    assert "a stop came 0.1 s ago, and without `asked_ns` nothing shows" in await refusal(undated)
+    assert "a stop came 0.1 s ago, and without `asked_ns` by the daemon's clock nothing shows" in await refusal(undated)
+    # Unix time, by mistake, is later than any stop.
+    other_clock = {**of_now, "asked_ns": 1_800_000_000_000_000_000}
+    assert "a stop came 0.1 s ago, and without `asked_ns` by the daemon's clock" in await refusal(other_clock)
     now_ns += 5_000_000_000
     undated["until_ns"] = now_ns + 1
     assert "a stop came" not in await refusal(undated)

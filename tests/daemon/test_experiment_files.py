@@ -262,6 +262,9 @@ class Runner:
     def motion(self) -> str | None:
         return self.refusal
 
+    def stood_s(self) -> float:
+        return 0.0
+
     def refusal_of(self, _file: Any, *, confirmed: bool) -> str | None:
         return None if confirmed else self.unconfirmed_refusal
 

@@ -47,6 +47,8 @@ PAUSE = "pause"
 STOP_DELAY_S = 0.05
 # A request that does not say when it was asked for may be this old.
 _OLDEST_S = 5.0
+# A later time is of another clock, such as Unix time.
+_LONGEST_AHEAD_NS = 86_400 * 10**9
 _LOOK_AGAIN = "look at the rig, and send it again"
 _ANOTHER_DAEMON = f"it is meant for an earlier daemon, and this one has begun since; {_LOOK_AGAIN}"
 
@@ -114,7 +116,7 @@ class Commands:
             if name != STOP and not self._is_for_this_one(request):
                 raise CommandRefusedError(_ANOTHER_DAEMON)
             if name not in MAY_BE_UNBOUND and not request.get("ask"):
-                _refuse_if(_why_unbound(name, request) or self._why_halted_since(request))
+                _refuse_if(_why_unbound(name, request, self.now_ns()) or self._why_halted_since(request))
             if name not in NEVER_LATE:
                 _refuse_if(self._deadline(request).why_passed())
             if name in (STOP, PAUSE):
@@ -358,18 +360,20 @@ def check_arguments(name: str, request: Request) -> None:
             raise CommandRefusedError(f"`{key}` is {printable(repr(value))[:40]}, and has to be {_KINDS[known[key]]}")
 
 
-def _why_unbound(name: str, request: Request) -> str | None:
-    """Return which arguments are missing that bind a request to a time and a daemon; None if none is missing.
+def _why_unbound(name: str, request: Request, now_ns: int) -> str | None:
+    """Return which arguments are missing, or of another clock, that bind a request to a time and a daemon, or None.
 
     The clock of `until_ns` begins again with the computer, so the daemon's `instance` belongs to it.
     """
     missing = [f"`{key}`" for key in ("instance", "until_ns") if key not in request]
-    if not missing:
-        return None
-    return (
-        f"{' and '.join(missing)} {'are' if missing[1:] else 'is'} missing, and this {name} may be an old one that "
-        "waited on its way: take them from the reply to `status`, as docs/messages.md says"
-    )
+    take = "from the reply to `status`, as docs/messages.md says"
+    if missing:
+        are = "are" if missing[1:] else "is"
+        why = f"{' and '.join(missing)} {are} missing, and this {name} may be an old one that waited on its way"
+        return f"{why}: take them {take}"
+    if request["until_ns"] - now_ns > _LONGEST_AHEAD_NS:
+        return f"`until_ns` is more than a day ahead, and this {name} would never be too late: take the clock {take}"
+    return None
 
 
 def required_rig(rig: "Rig | None") -> "Rig":

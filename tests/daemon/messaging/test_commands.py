@@ -152,6 +152,16 @@ async def test_what_is_asked_for_too_long_ago_is_refused_unless_it_lets_nothing_
 
 
 @pytest.mark.parametrize("name", ["start", "resume", "unlock", "release"])
+async def test_a_request_whose_time_is_of_another_clock_is_refused(name):
+    """By Unix time it would never be too late."""
+    rig = SimpleNamespace(tasks=dict, rig="bench")
+    commands = Commands(None, None, None, rig, asyncio.Event(), None, now_ns=lambda: 7_000_000_000)
+    bound = meant_for(await commands.handlers()[STATUS]({}), 0.0, 2.0)
+    with pytest.raises(CommandRefusedError, match=rf"more than a day ahead.* and this {name} would never be too late"):
+        await commands.handlers()[name]({**bound, "until_ns": 1_800_000_000_000_000_000})
+
+
+@pytest.mark.parametrize("name", ["start", "resume", "unlock", "release"])
 async def test_a_stop_ends_every_request_that_was_asked_for_before_it(name):
     """The daemon stood still for a moment, and read the stop before the older request."""
     now_ns, rig = 7_000_000_000, SimpleNamespace(tasks=dict, rig="bench")

@@ -144,8 +144,9 @@ def _run(argv: Sequence[str] | None) -> int:
 
 
 def _with_notes(sentence: str, error: BaseException) -> str:
-    notes = getattr(error, "__notes__", ())
-    return ". ".join([sentence.removesuffix("."), *notes]) if notes else sentence
+    for note in getattr(error, "__notes__", ()):
+        sentence = f"{sentence}{'' if sentence.endswith(('.', '?')) else '.'} {note}"
+    return sentence
 
 
 def _overview() -> argparse.ArgumentParser:

@@ -57,7 +57,9 @@ class Clock:
 
     def suspended_ns(self) -> int:
         """Return how long the computer was suspended since it started, in nanoseconds."""
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+        # In this order, so that the time between the two readings makes it no negative one.
+        monotonic_ns = time.monotonic_ns()
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - monotonic_ns
 
     def unix_s(self, t_mono_ns: int) -> float:
         """Return the Unix time, in seconds, of a reading of the monotonic clock."""

@@ -37,6 +37,8 @@ STRAY = "leave the values around them and come back at once: spikes of a damaged
 _STEPS_AROUND = 4
 # Values further apart than this number of periods are no neighbours.
 _NEIGHBOUR_PERIODS = 3.0
+# In a longer time the rig can turn to another torque and back.
+_LONGEST_STRAY_S = 0.5
 
 
 def valid_load(path: Path, unix_s: FloatArray, torque_nm: FloatArray) -> tuple[IntArray, list[str]]:
@@ -122,7 +124,8 @@ def stray_values(t_s: FloatArray, torque_nm: FloatArray) -> BoolArray:
         below_nm = np.minimum(before, after) - values.max(axis=0)
         around_nm = _STRAY_STEPS * np.minimum(moves_nm[first - 1], moves_nm[first + width - 1])
         limit_nm = np.maximum(np.maximum(around_nm, least_nm), np.abs(after - before))
-        are_neighbours = t_s[first + width] - t_s[first - 1] <= (width + 1) * _NEIGHBOUR_PERIODS * period_s
+        longest_s = min((width + 1) * _NEIGHBOUR_PERIODS * period_s, _LONGEST_STRAY_S)
+        are_neighbours = t_s[first + width] - t_s[first - 1] <= longest_s
         for at in first[are_neighbours & (np.maximum(above_nm, below_nm) > limit_nm)]:
             is_stray[at : at + width] = True
     return is_stray

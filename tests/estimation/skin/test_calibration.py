@@ -274,7 +274,7 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path):
         ("r1_ohm,r2_ohm,shear_n,normal_n\n", "no rows"),
         ("r1_ohm,r2_ohm,shear_n,normal_n,shear_n\n25,25,0,0,1\n", "2 columns are called 'shear_n'"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,x,0,0\n", "line 3: r2_ohm: 'x' is not a number"),
-        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0\n", "line 2: normal_n: .* is not a number"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0\n", "line 2: normal_n: has no value"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0,0\n", "line 2: a value without a column: "),
         (
             "r1_ohm;r2_ohm;shear_n;normal_n\n25,1;25,2;0;0\n",

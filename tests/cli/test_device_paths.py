@@ -81,7 +81,7 @@ def alarm() -> Iterator[None]:
 def test_every_command_refuses_a_device_or_pipe_in_the_place_of_a_file(
     command, tmp_path, config, tiny_calibration, imported, mistake
 ):
-    (tmp_path / "steps.yaml").write_text("name: one\nsteps: [{do: pause, duration_s: 1}]\n")
+    (tmp_path / "steps.yaml").write_text("name: one\nsteps: [{do: wait, wait_s: 1}]\n")
     os.mkfifo(tmp_path / "pipe")
     robot_at("127.0.0.1", tmp_path)
     emulated = [{"device": "eit-kit", "arguments": ["--link", "eit-right"]}]

@@ -76,7 +76,7 @@ def sentences_of_run(config: "DaemonConfig") -> Iterator[str]:
         yield f"{config.experiment} starts by itself, and ends the rehearsal"
     elif settings is not None:
         reached = f" --connect {shlex.quote(config.commands)}" if config.commands != COMMAND_ADDRESS else ""
-        yield f"no `experiment` is configured: start one with `shearloop command start{reached}`"
+        yield f"no `experiment` is configured: start one with `shearloop command start --experiment FILE{reached}`"
     if config.recording is not None:
         yield f"recordings go into {config.recording.folder}"
 

@@ -297,13 +297,14 @@ class EitKit(SerialSensor[Frame]):
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
-        parser = self._frame_parser
+        parser, found = self._frame_parser, super().diagnostics()
+        is_measured = found["connected"] and parser.clock.learned_from
         return {
-            **super().diagnostics(),
+            **found,
             "frames": parser.frames,
             "errors": {kind.name.lower(): count for kind, count in parser.errors.items()},
             "expected_hz": 1.0 / self._period_s,
-            "measured_hz": 1.0 / self.period_s if parser.clock.learned_from else None,
+            "measured_hz": 1.0 / self.period_s if is_measured else None,
         }
 
     @property

@@ -289,7 +289,7 @@ class ControlLoop:
         if reason := reason or self._awaited_judgement():
             return reason
         if not confirmed and (drops := self.operator.drop_sentence(file)):
-            return f"{drops}; secure it, then confirm it with `shearloop command start --yes`"
+            return f"{drops}; secure it, then send the same command with `--yes`"
         return None
 
     def start(self, file: ExperimentFile, t_ns: int, *, confirmed: bool = False) -> str | None:

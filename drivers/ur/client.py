@@ -108,7 +108,7 @@ class UrRobot:
             "connected": self.state is not None,
             "states": self.states,
             "errors": dict(self.losses),
-            "rate_hz": self.measured_hz,
+            "rate_hz": self.measured_hz if self.state is not None else None,
             "expected_hz": self.settings.rate_hz,
             "error": self._why_slow() if self.monitor.latest.up else self.monitor.latest.sentence,
         }

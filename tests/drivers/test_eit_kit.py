@@ -60,7 +60,20 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path):
     assert [event.up for event in events] == [True]
     facts = kit.diagnostics()
     assert (facts["frames"], facts["errors"], facts["connected"]) == (60, {}, False)
-    assert facts["measured_hz"] == pytest.approx(1 / kit.period_s)
+    assert facts["measured_hz"] is None, "a board that is gone has no rate"
+
+
+async def test_a_connected_board_has_the_rate_of_its_frames(tmp_path):
+    link, found = tmp_path / "eit", []
+    async with running(EitKitBoard(map(format_line, some_lines(60)), period_s=0.02, link=link).run()):
+        kit = EitKit(SerialLink(path=link), PAPER_TABLE.zero_slots, 0.02)
+        async with aclosing(kit.readings()) as readings:
+            async for frame in readings:
+                found.append((kit.diagnostics()["measured_hz"], 1 / kit.period_s))
+                if frame.seq == 50:
+                    break
+    assert found[0][0] is None, "one frame has no rate"
+    assert found[-1][0] == pytest.approx(found[-1][1])
 
 
 async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path):

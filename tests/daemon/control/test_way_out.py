@@ -614,7 +614,7 @@ def test_no_start_lets_a_held_tool_go_without_a_confirmation(sense, steps, said)
         assert refused is None
         return
     assert refused.startswith(said)
-    assert refused.endswith("; secure it, then confirm it with `shearloop command start --yes`")
+    assert refused.endswith("; secure it, then send the same command with `--yes`")
     assert rig.control_loop.running_experiment is None
     assert rig.control_loop.start(file, rig.t_ns, confirmed=True) is None
 

@@ -27,6 +27,8 @@ QUIET_S = 3.0
 # A publisher that runs accepts a connection in less.
 PROBE_S = 0.3
 LONGEST_TIMEOUT_S = 86_400.0
+# While a reply is awaited, the connection is looked at this often.
+_GONE_AFTER_MS = 1000
 _ALLOW = "`sudo shearloop keys allow FILE` on the daemon's computer"
 
 
@@ -283,17 +285,22 @@ async def ask(
             async with timeout(timeout_s):
                 await socket.send(encode(content))
                 sent = True
+                while not await socket.poll(_GONE_AFTER_MS):
+                    # With IMMEDIATE nothing can be sent without a connection.
+                    if not int(socket.getsockopt(zmq.EVENTS)) & zmq.POLLOUT:
+                        raise ConnectionResetError
                 return decode(await socket.recv())
-        except TimeoutError as error:
+        except (TimeoutError, ConnectionResetError) as error:
             in_doubt = may_act and sent
             late = ". One that runs may have carried it out: see `shearloop command status`" if in_doubt else ""
             if content.get("command") == "stop":
                 late = ". Nothing says that the arm stands: use the emergency stop. If the stop still arrives, it "
                 late += f"stops what moves then; {_end_sentence(content)}"
+            what = f"no daemon answered at {address} within {timeout_s:g} s"
+            if isinstance(error, ConnectionResetError):
+                what = f"the daemon at {address} ended, or the connection to it, before it answered"
             kind = UnansweredError if in_doubt else UserError
-            raise kind(
-                f"no daemon answered at {address} within {timeout_s:g} s; {_cure(address, keys)}{late}"
-            ) from error
+            raise kind(f"{what}; {_cure(address, keys)}{late}") from error
         except ValueError as error:
             raise foreign_reply(address, error) from error
 

@@ -89,6 +89,21 @@ async def test_req_and_dealer_clients_are_answered():
                 assert not decode(await client.recv())["ok"]
 
 
+@pytest.mark.parametrize("address", ["ipc://{}/commands", "tcp://127.0.0.1:*"])
+async def test_nobody_waits_for_a_daemon_that_has_ended(address, tmp_path, monkeypatch):
+    monkeypatch.setattr("shearloop.daemon.messaging.client._GONE_AFTER_MS", 20)
+    request = {"command": "start", "confirmed": True}
+    with zmq.asyncio.Context() as context:
+        with context.socket(zmq.ROUTER) as daemon:
+            daemon.bind(address.format(tmp_path))
+            bound = daemon.getsockopt_string(zmq.LAST_ENDPOINT)
+            asked = asyncio.create_task(ask(context, bound, request, 150.0, None))
+            await daemon.recv_multipart()
+        with pytest.raises(UserError, match="ended, or the connection to it, before it answered") as refused:
+            await asyncio.wait_for(asked, 20.0)
+    assert "may have carried it out" in str(refused.value)
+
+
 async def test_only_a_request_that_was_sent_may_still_be_carried_out(tmp_path):
     request = {"command": "release", "confirmed": True}
     with zmq.asyncio.Context() as context, context.socket(zmq.ROUTER) as silent:

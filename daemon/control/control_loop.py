@@ -33,7 +33,7 @@ from shearloop.daemon.control.held_tool import HeldTool
 from shearloop.daemon.control.inputs import ArmStatus, GripperStatus, LatestInputs
 from shearloop.daemon.control.operator_view import OperatorView
 from shearloop.daemon.control.safety import SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.step_motions import Speeds, first_gripper_step
+from shearloop.daemon.control.step_motions import Speeds, first_gripper_step, needs_torque
 from shearloop.daemon.control.torque_controller import WristCommand
 from shearloop.daemon.control.wrist_controller import Compute, WristController, at_once
 from shearloop.daemon.loop_config import LoopConfig
@@ -299,11 +299,11 @@ class ControlLoop:
             self.tool.judge(self.inputs.gripper)
         if (reason := self.refusal_of(file, t_ns, confirmed=confirmed)) is not None:
             return reason
-        driving, speeds = self.sources[file.torque_source], Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
+        self.wrist = self._wrist_of(file)
+        driving, speeds = self.wrist.source, Speeds(wrist_rad_per_s=self.config.wrist_speed_rad_per_s)
         self.experiment = Experiment(file, t_ns, speeds, self.operator.known_tool())
         self._watched = replace(self._watched, driving=driving, supervising=self._others(driving))
         self.stated_tool_mm = file.tool_mm
-        self.wrist = self._wrists[file.torque_source]
         # What the last experiment knew of the tool may be wrong by now.
         self.wrist.reset()
         self.tool.begin_experiment()
@@ -314,6 +314,13 @@ class ControlLoop:
         phase, activity = self.experiment.phase.value, self.experiment.command.activity
         self.status = LoopStatus(phase, activity, WristCommand(), SafetyDecision(Response.NOTE))
         return None
+
+    def _wrist_of(self, file: ExperimentFile) -> WristController:
+        """Return the wrist's controller; an experiment that needs no torque may name a source without one."""
+        name = file.torque_source
+        if name not in self._wrists and not needs_torque(file, has_gripper=self.tool.has_gripper):
+            name = next(iter(self._wrists))
+        return self._wrists[name]
 
     def pause(self) -> str | None:
         """Stand still until `resume`; return None, or why not."""
@@ -456,7 +463,7 @@ class ControlLoop:
 
     def _choose_command(self, experiment: Experiment, tick: _Tick) -> None:
         """Let the experiment choose its command; it ends if it would turn a tool that may be in the gripper."""
-        latest = self.inputs.torques.get(experiment.file.torque_source)
+        latest = self.inputs.torques.get(self.wrist.source.name)
         torque_nm = latest.torque_nm if latest is not None and not tick.on_hold else None
         gripped_at_rad = self.tool.count_angle(tick.wrist_rad)
         clock_stands = tick.on_hold or (experiment.command.turns and bool(tick.awaited))

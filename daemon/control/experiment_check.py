@@ -1,7 +1,7 @@
 """Checks of an experiment: the steps that limits, devices or the steps before do not allow. No I/O."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from itertools import repeat
 
@@ -29,6 +29,7 @@ from shearloop.daemon.control.experiment_schema import (
 )
 from shearloop.daemon.control.known_tool import NOTHING_KNOWN, known_after
 from shearloop.daemon.control.step_demands import demand
+from shearloop.daemon.control.step_motions import needs_torque
 from shearloop.daemon.control.turns import Turn, turns
 from shearloop.daemon.motion_cap import Commissioning, MotionCap, knows_tool
 from shearloop.daemon.torques import LOAD_CELL, WRENCH, Direction, TorqueSource, direction_of
@@ -38,14 +39,6 @@ from shearloop.estimation import Measured
 
 # Numbers of a file may differ from a cap by rounding.
 _ROUNDING = 1e-9
-
-
-def too_noisy(source: str, noise_nm: float, limit_nm: float) -> str:
-    """Return why a source cannot drive an experiment with this torque limit."""
-    return (
-        f"`torque_source: {source}`: its torque is known to {noise_nm:g} N·m only, and the smallest limit is "
-        f"{limit_nm:g} N·m, which its noise alone may pass; let a fingertip or the load cell drive"
-    )
 
 
 def not_measured(file: ExperimentFile, driving: TorqueSource) -> Iterator[tuple[int, str]]:
@@ -297,17 +290,14 @@ def experiment_mistakes(
     content: object, config: DaemonConfig, sources: Mapping[str, TorqueSource], robot: Commissioning | None = None
 ) -> list[Mistake]:
     """Return each step and key of an experiment's content that its own limits or the devices do not allow."""
-    driving = [*(name for name, source in sources.items() if source.measures_torque), WRENCH]
     file = outline(content)
+    needs = needs_torque(file, has_gripper=config.gripper is not None)
     limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
     mistakes = check_steps(file, cap)
     mistakes += check_devices(file, limits, config.gripper_model, cap)
-    if file.torque_source and file.steps:
-        mistakes += _undriven(file.torque_source, driving, config)
-        if file.torque_source == WRENCH and robot is not None:
-            noise_nm, limit_nm = robot.settings.facts.mean_noise_nm, file.tightest_nm
-            if noise_nm >= limit_nm:
-                mistakes.append((("torque_source",), too_noisy(WRENCH, noise_nm, limit_nm)))
+    if file.torque_source and needs:
+        named = isinstance(content, dict) and "torque_source" in content
+        mistakes += _undriven(file, sources, config, robot, named=named)
     if file.torque_source in sources:
         mistakes += [(("steps", number), why) for number, why in not_measured(file, sources[file.torque_source])]
     if config.gripper is None:
@@ -321,7 +311,7 @@ def experiment_mistakes(
     from shearloop.daemon.control.sensor_reach import beyond_reach
 
     mistakes += [(("steps", number), why) for number, why in beyond_reach(file, sources)]
-    wrong = _wrong_tools(file, sources, known=knows_tool(file.tool_mm, config, robot))
+    wrong = _wrong_tools(file, sources, known=knows_tool(file.tool_mm, config, robot)) if needs else ()
     place = "torque_source" if file.tool_mm is None else "tool_mm"
     mistakes += [((place,), why) for why in wrong]
     return mistakes + _unadaptable(file, sources)
@@ -349,12 +339,33 @@ def _wrong_tools(file: ExperimentFile, sources: Mapping[str, TorqueSource], *, k
                 )
 
 
-def _undriven(drive: str, driving: Sequence[str], config: DaemonConfig) -> list[Mistake]:
-    """Return the mistake of a `torque_source` that measures no torque, if it is one."""
+def _undriven(
+    file: ExperimentFile,
+    sources: Mapping[str, TorqueSource],
+    config: DaemonConfig,
+    robot: Commissioning | None,
+    *,
+    named: bool,
+) -> list[Mistake]:
+    """Return the mistake of a `torque_source` that cannot drive, if it is one; `named`: the file has this key."""
+    drive, driving = file.torque_source, [name for name, source in sources.items() if source.measures_torque]
+    noise_nm, limit_nm = robot.settings.facts.mean_noise_nm if robot is not None else 0.0, file.tightest_nm
+    noisy = f"is known to {noise_nm:g} N·m only, and the smallest limit is {limit_nm:g} N·m"
+    if noise_nm < limit_nm:
+        driving.append(WRENCH)
     if drive in driving:
         return []
-    near = "".join(f"; did you mean {name}?" for name in get_close_matches(drive, driving, 1))
-    return [(("torque_source",), f"`{drive}` {_why_not_driving(drive, config)}; there are {', '.join(driving)}{near}")]
+    cause, cure = _why_not_driving(drive, config)
+    if drive == WRENCH:
+        cause, cure = f"{noisy}, which its noise alone may pass", "calibrate a fingertip, or add a load cell"
+    if driving:
+        there = f"there are {', '.join(driving)}" if driving[1:] else f"there is only {driving[0]}"
+        near = "".join(f"; did you mean {name}?" for name in get_close_matches(drive, driving, 1))
+        cure = f"choose another, or {cure}; {there}{near}"
+    elif drive != WRENCH:
+        cure += f"; no other can drive, because the wrench {noisy}"
+    default = "" if named else f"; the file names no `torque_source`, and {drive} is the default"
+    return [(("torque_source",), f"`{drive}` {cause}: {cure}{default}")]
 
 
 def _unadaptable(file: ExperimentFile, sources: Mapping[str, TorqueSource]) -> list[Mistake]:
@@ -381,9 +392,10 @@ def _unadaptable(file: ExperimentFile, sources: Mapping[str, TorqueSource]) -> l
     return found
 
 
-def _why_not_driving(drive: str, config: DaemonConfig) -> str:
+def _why_not_driving(drive: str, config: DaemonConfig) -> tuple[str, str]:
+    """Return why a source does not measure torques, and the cure."""
     if drive in config.fingertips:
-        return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
+        return "is a fingertip without a calibration, which has no torque", "add `calibration`"
     if drive == "skin" and config.skin is not None:
-        return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
-    return "is not a measured torque: choose another, or configure its device"
+        return "has no torque without a radius", "add `skin.tool_radius_mm`"
+    return "is not a measured torque", "configure its device"

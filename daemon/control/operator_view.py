@@ -161,9 +161,8 @@ class OperatorView:
 
     def why_not_begun(self, file: ExperimentFile) -> str | None:
         """Return why a tool in the gripper, a silent sensor or an unknown zero forbids an experiment, or None."""
-        driving = self.sources[file.torque_source]
         reason = self._why_no_activation(file) or self._why_no_grip(file) or self._why_no_sensor(file)
-        if reason := reason or self._why_no_zero(file, driving):
+        if reason := reason or self._why_no_zero(file):
             return reason
         number, uncertain = first_motion_before_grip(file), self.tool.uncertain
         if number is None:
@@ -222,10 +221,13 @@ class OperatorView:
         missing = [fault for fault in faults if fault is not None and fault.code is not FaultCode.ESTIMATE_INVALID]
         return self.inputs.why_refused(missing, self.inputs.ticked_ns)
 
-    def _why_no_zero(self, file: ExperimentFile, driving: TorqueSource) -> str | None:
+    def _why_no_zero(self, file: ExperimentFile) -> str | None:
         """Return why the driving torque needs a zero first, or None: without one, every limit would be wrong."""
         number = first_turn_before_tare(file, holds=self.tool.may_hold())
-        if number is None or not driving.needs_zero or self.zero_known.get(driving.name, False):
+        if number is None:
+            return None
+        driving = self.sources[file.torque_source]
+        if not driving.needs_zero or self.zero_known.get(driving.name, False):
             return None
         # The command tares only sensors. A step `tare` also tares the robot's wrench.
         command = "" if driving.from_robot else ", or send `shearloop command tare` with nothing gripped"

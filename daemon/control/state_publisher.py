@@ -133,7 +133,7 @@ def _log(message: LoopState, now: _LogKey, before: _LogKey | None) -> None:
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
     """Return the `loop.state` message at now_ns."""
     status, experiment, wrist = control_loop.status, control_loop.experiment, control_loop.wrist
-    driving = experiment.file.torque_source if experiment is not None else ""
+    driving = wrist.source.name if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
     untared = latest is not None and wrist.source.needs_zero and not control_loop.has_zero(driving)
     if latest is not None and (untared or now_ns - latest.t_ns > 1e9 * wrist.source.fresh_s):

@@ -1,6 +1,7 @@
 """The first step of each kind that an experiment has, and the largest speeds."""
 
 import math
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from shearloop.daemon.control.experiment_schema import (
@@ -10,6 +11,7 @@ from shearloop.daemon.control.experiment_schema import (
     GripperStep,
     GripStep,
     ReleaseStep,
+    Step,
     TareStep,
     TurnToStep,
     TwistingStep,
@@ -47,12 +49,28 @@ def first_measured(file: ExperimentFile, *, holds: bool) -> int | None:
 
     `holds`: whether the gripper may hold a tool as the experiment begins.
     """
+    for number, step, held in _with_held(file, holds=holds):
+        if isinstance(step, AdaptStep | TareStep | TwistingStep) or (held and isinstance(step, TurnToStep)):
+            return number
+    return None
+
+
+def needs_torque(file: ExperimentFile, *, has_gripper: bool) -> bool:
+    """Return whether a step needs a torque that can drive, whatever the gripper holds as the experiment begins.
+
+    A straight move with a tool needs one for its limit. No start allows one before the first grip if the gripper may
+    hold a tool; without a gripper, a tool may be clamped.
+    """
+    carries = any(held and isinstance(step, ApproachStep) for _, step, held in _with_held(file, holds=not has_gripper))
+    return carries or first_measured(file, holds=True) is not None
+
+
+def _with_held(file: ExperimentFile, *, holds: bool) -> Iterator[tuple[int, Step, bool]]:
+    """Yield each step with its number, from 1, and whether a tool may be held in it; `holds` as above."""
     for number, step in enumerate(file.steps, 1):
         if isinstance(step, GripperStep):
             holds = not isinstance(step, ReleaseStep)
-        if isinstance(step, AdaptStep | TareStep | TwistingStep) or (holds and isinstance(step, TurnToStep)):
-            return number
-    return None
+        yield number, step, holds
 
 
 def first_gripper_step(file: ExperimentFile) -> tuple[int, GripperStep] | None:

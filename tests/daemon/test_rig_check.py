@@ -322,9 +322,66 @@ def test_a_missing_experiment_file_is_refused_by_name(tmp_path):
 
 @pytest.mark.parametrize(("generation", "refused"), [("e-series", False), ("cb3", True)])
 def test_a_wrench_that_a_controller_estimates_drives_nothing_gentle(generation, refused, tmp_path):
-    settings = read_settings(Path(__file__).parents[2] / "config" / "ur.yaml")
-    limits = replace(settings.limits, torque_nm=TorqueBound(8.0, 12.0), force_n=ForceBound(45.0, 60.0))
-    robot = Commissioning(replace(settings, generation=generation, limits=limits), None, emulated=True)
+    robot = commissioned(generation)
     made = config(tmp_path, {"torque_source": "wrench", "limits": {"torque_nm": 0.1}})
     with pytest.raises(UserError, match="known to 5 N·m only") if refused else nullcontext():
         check_experiment(made, SOURCES, robot)
+
+
+RELEASE, CLOSE, WAIT = {"do": "release"}, {"do": "grip"}, {"do": "wait", "wait_s": 1}
+RETREAT = {"do": "retreat", "along_tool_m": -0.05}
+BARE = {name: TorqueSource(name=name, period_s=0.5, measures_torque=False) for name in ("right", "left")}
+BARE_RIG = {"fingertips": {"right": SERIAL}, "gripper": {"model": "2F-140", "socket": {"host": "127.0.0.1"}}}
+
+
+def commissioned(generation: str = "cb3") -> Commissioning:
+    settings = read_settings(Path(__file__).parents[2] / "config" / "ur.yaml")
+    limits = replace(settings.limits, torque_nm=TorqueBound(8.0, 12.0), force_n=ForceBound(45.0, 60.0))
+    return Commissioning(replace(settings, generation=generation, limits=limits), None, emulated=True)
+
+
+@pytest.mark.parametrize("keys", [{}, {"torque_source": "wrench"}, {"torque_source": "right", "tool_mm": 20}])
+@pytest.mark.parametrize(
+    ("steps", "needs"),
+    [
+        ([RELEASE, CLOSE, WAIT, RELEASE], False),
+        ([RETREAT, RELEASE, *TURN, CLOSE], False),
+        ([CLOSE, RELEASE, RETREAT, *TURN], False),
+        # The tool is held, or may be held, while the arm moves or the wrist turns.
+        ([CLOSE, RETREAT, RELEASE], True),
+        ([CLOSE, *TURN], True),
+        ([*TURN, RELEASE], True),
+        ([{"do": "grip", "expect_object": False}, *TURN], True),
+        ([RELEASE, {"do": "tare"}, CLOSE], True),
+    ],
+)
+def test_only_a_step_that_needs_a_torque_asks_for_a_source_that_can_drive(tmp_path, keys, steps, needs):
+    made = config(tmp_path, {**keys, "steps": steps}, **BARE_RIG)
+    with pytest.raises(UserError, match="torque_source: `") if needs else nullcontext():
+        check_experiment(made, BARE, commissioned())
+
+
+def test_a_straight_move_of_a_clamped_tool_asks_for_a_source_that_can_drive(tmp_path):
+    made = config(tmp_path, {"steps": [RETREAT]}, fingertips={"right": SERIAL})
+    with pytest.raises(UserError, match="torque_source: `right` is a fingertip without"):
+        check_experiment(made, BARE, commissioned())
+
+
+def test_no_source_is_offered_that_is_refused_next(tmp_path):
+    def said(robot: Commissioning | None, sources: dict[str, TorqueSource] = BARE, **keys: Any) -> str:
+        with pytest.raises(UserError) as error:
+            check_experiment(config(tmp_path, {"limits": {"torque_nm": 5}, **keys}, **BARE_RIG), sources, robot)
+        return str(error.value).partition("torque_source: ")[2]
+
+    bare = "`right` is a fingertip without a calibration, which has no torque: "
+    noisy = "is known to 5 N·m only, and the smallest limit is 5 N·m"
+    default = "; the file names no `torque_source`, and right is the default"
+    assert said(commissioned()) == f"{bare}add `calibration`; no other can drive, because the wrench {noisy}{default}"
+    named = {"torque_source": "right"}
+    assert said(None, **named) == f"{bare}choose another, or add `calibration`; there is only wrench"
+    cell = {**BARE, **LOAD}
+    assert said(commissioned(), cell, **named) == f"{bare}choose another, or add `calibration`; there is only load_cell"
+    wrench = {"torque_source": "wrench"}
+    passed = f"`wrench` {noisy}, which its noise alone may pass: "
+    assert said(commissioned(), **wrench) == f"{passed}calibrate a fingertip, or add a load cell"
+    assert said(commissioned(), cell, **wrench).endswith("or add a load cell; there is only load_cell")

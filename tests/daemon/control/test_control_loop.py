@@ -144,6 +144,29 @@ def test_a_sensor_that_is_gone_or_silent_refuses_what_needs_torques_before_anyth
     assert loop.start(ExperimentFile(name="test", steps=steps, torque_source=drive), rig.t_ns) is None
 
 
+@pytest.mark.parametrize("named", ["right", "absent"])
+def test_an_experiment_that_only_grips_runs_without_a_torque_of_its_source_and_the_others_watch_it(named):
+    sources = {"right": replace(EIT, measures_torque=False), "load_cell": replace(LOAD, needs_zero=True)}
+    wait = {"do": "wait", "wait_s": 1}
+    for load_nm in (0.0, 1.0):
+        rig = started(
+            Rig(ControlLoop(CONFIG, sources, ("gripper",))), GRIP, wait, {"do": "release"}, torque_source=named
+        )
+        assert loop_state(rig.control_loop, 0.0, rig.t_ns).torque_source == "load_cell"
+        rig.twin = SimpleNamespace(step=lambda *_, nm=load_nm: SimpleNamespace(torque_nm=nm, shear_torque_nm=nm))
+        rig.run(20)
+        assert phase(rig) is (ExperimentPhase.STOPPED if load_nm else ExperimentPhase.DONE)
+    assert rig.control_loop.safety.waiting.faults[0].code is FaultCode.TORQUE_LIMIT
+
+
+def test_a_loop_turns_a_tool_by_the_named_torque_alone():
+    rig = Rig(new_loop())
+    rig.run(2)
+    file = ExperimentFile.model_validate({"name": "test", "steps": [GRIP, {"do": "identify"}], "torque_source": "left"})
+    with pytest.raises(KeyError):
+        rig.control_loop.start(file, rig.t_ns)
+
+
 @pytest.mark.parametrize("stood_s", [0.12, 0.34, 0.9])
 @pytest.mark.parametrize("decided_since", [False, True])
 def test_states_that_are_old_because_the_daemon_stood_still_are_not_blamed_on_a_cable(stood_s, decided_since):

@@ -356,7 +356,10 @@ def test_a_stop_on_the_way_of_the_fingers_says_what_may_be_in_them(before, step,
 @pytest.mark.parametrize("sense", [{"uncertain": True}, {"unfelt": True}, {"moving": True}])
 def test_a_tare_with_an_uncertain_gripper_has_to_be_confirmed(sense):
     rig = held(**sense)
-    assert "does not know whether it holds a tool" in (rig.control_loop.operator.tare_refusal() or "")
+    refusal = rig.control_loop.operator.tare_refusal() or ""
+    assert "does not know whether it holds a tool" in refusal
+    assert "`shearloop command release --yes`" in refusal
+    assert "tare again" not in refusal, "no load is the cause"
     assert rig.control_loop.operator.tare_refusal(confirmed=True) is None
 
 

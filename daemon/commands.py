@@ -280,7 +280,8 @@ class Commands:
         lost = [name for name in names if tasks.get(name, {}).get("connected") is False]
         taring = [name for name in names if name not in lost]
         if not taring:
-            raise CommandRefusedError(f"not connected: {' and '.join(lost)}; connect it, then send the tare again")
+            them = "them" if lost[1:] else "it"
+            raise CommandRefusedError(f"not connected: {' and '.join(lost)}; connect {them}, then send the tare again")
         for name in taring:
             sensors[name].tare(confirmed=confirmed)
         reply: dict[str, Any] = {"taring": taring}

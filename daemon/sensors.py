@@ -103,6 +103,13 @@ def build_sensors(
         return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
 
     patience = patience_of(config)
+    boards = {
+        name: EitKit(
+            link(name, config.fingertips[name].device), session.calibration.table.zero_slots,
+            config.fingertips[name].frame_period_s, inputs(name), patience,
+        )
+        for name, session in sessions.fingertips.items()
+    }  # fmt: skip
     pairs: CombinedTask | None = None
     if (combined := sessions.combined) is not None:
         sides = combined.calibration.sides
@@ -111,16 +118,15 @@ def build_sensors(
             COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
             longest_tare_s=_longest_tare_s(config.fingertips[sides[0]]),
             period_s=period_s, pairing=FramePairing(sides, period_s), sides=[inputs(side) for side in sides],
+            boards={side: boards[side] for side in sides},
         )  # fmt: skip
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}
     for name, session in sessions.fingertips.items():
         own = config.fingertips[name]
-        zero_slots = session.calibration.table.zero_slots
-        board = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
         task = BoardTask(
             name, session, publisher, clock, loop, gripper, inputs(name), longest_tare_s=_longest_tare_s(own),
-            board=board, combined=pairs, always_heatmap=own.heatmap == "always",
+            board=boards[name], combined=pairs, always_heatmap=own.heatmap == "always",
         )  # fmt: skip
         tasks[name] = tareable[name] = task
     if pairs is not None:

@@ -3,7 +3,7 @@
 import asyncio
 import contextlib
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import structlog
@@ -24,11 +24,12 @@ from shearloop.words import counted
 class CombinedTask(FingertipTask):
     """Pairs the frames of several fingertips, which their boards' tasks add, and estimates from each pair.
 
-    `sides` are the recorders of the boards' inputs.
+    `sides` are the recorders of the boards' inputs. It is connected while all of its `boards` are.
     """
 
     period_s: float
     pairing: FramePairing[Frame]
+    boards: Mapping[str, EitKit]
     sides: Sequence[InputRecorder | None] = ()
     _pairs: deque[tuple[Frame, ...]] = field(default_factory=deque)
     _in_order: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -85,11 +86,14 @@ class CombinedTask(FingertipTask):
 
     def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
+        lost = [side for side, board in self.boards.items() if not board.diagnostics()["connected"]]
+        loss = f"without {' and '.join(lost)} there is no combined estimate" if lost else ""
         return {
+            "connected": not lost,
             "expected_hz": 1.0 / self.period_s,
             "estimates": self.count,
             "unpaired": dict(self.pairing.unpaired),
-            "error": self._unpaired_sentence,
+            "error": "; ".join(filter(None, (self.why_no_zero(), loss or self._unpaired_sentence))),
         }
 
 
@@ -153,10 +157,10 @@ class BoardTask(FingertipTask):
     def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
         board = self.board.diagnostics()
-        errors = (self.dead_electrodes.sentence, str(board["last_refusal"]))
+        errors = (self.dead_electrodes.sentence, board["last_refusal"]) if board["connected"] else (board["last_loss"],)
         return {
             **board,
             "rate_hz": board["measured_hz"],
-            "error": "; ".join(filter(None, errors)) if board["connected"] else board["last_loss"],
+            "error": "; ".join(str(error) for error in (self.why_no_zero(), *errors) if error),
             "estimates": self.count,
         }

@@ -103,13 +103,19 @@ class LoadCellTask:
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`."""
+        # Also where no reading comes.
+        self._expire_zero(self._clock.now_ns())
         found = self._board.diagnostics()
-        own = found["last_refusal"]
+        own = str(found["last_refusal"])
         if self._latest is not None and self._latest.other_unit is not None:
             own = self._latest.other_unit.clause
-        if self._zero is not None and self._zero.reason:
-            own = self._zero.reason
-        error = own if found["connected"] else found["last_loss"]
+        why_no_zero = self._zero.reason if self._zero is not None else ""
+        error = why_no_zero or own
+        if not found["connected"]:
+            loss = str(found["last_loss"])
+            # The reason may end with the same loss.
+            said = loss.removesuffix(".") in why_no_zero
+            error = why_no_zero if said else "; ".join(filter(None, (why_no_zero, loss)))
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, zero: ZeroRequest, within_s: float) -> str:
@@ -127,15 +133,20 @@ class LoadCellTask:
         zero = self._zero
         if zero is None or not zero.is_open:
             return
-        if zero.is_too_late(sample.t_arrival_ns):
-            zero.expire(self._not_taken(zero, self._timeout_s))
-            structlog.get_logger().warning(zero.reason)
+        self._expire_zero(sample.t_arrival_ns)
+        if not zero.is_open:
             return
         if sample.trusted and sample.t_mid_ns >= zero.from_ns:
             zero.collect()
             self._raw.append(sample.raw)
         if len(self._raw) == ZERO_SAMPLES:
             self._end_zero(zero, self._raw)
+
+    def _expire_zero(self, t_ns: int) -> None:
+        """End a request for a zero for which a reading that arrives then is too late."""
+        if self._zero is not None and self._zero.is_too_late(t_ns):
+            self._zero.expire(self._not_taken(self._zero, self._timeout_s))
+            structlog.get_logger().warning(self._zero.reason)
 
     def _end_zero(self, zero: ZeroRequest, samples: Sequence[float]) -> None:
         """Make the mean of raw samples the zero, unless they are of a load, or of one that came or went."""

@@ -91,7 +91,7 @@ class SkinTask:
         async with contextlib.aclosing(self._skin.batches()) as batches:
             async for samples in batches:
                 for sample in samples:
-                    self._expire_zero(sample)
+                    self._expire_zero(sample.t_arrival_ns)
                     self._publish(sample, self._estimator.update(sample))
                     self._follow_estimator()
                     self._warn_of_drift()
@@ -130,9 +130,9 @@ class SkinTask:
         self._estimator.tare(now_ns, self._zero.until_ns)
         return self._zero
 
-    def _expire_zero(self, sample: SkinSample) -> None:
-        """End a request for which this sample comes too late; the estimator gives up by the same time."""
-        if self._zero is not None and self._zero.is_too_late(sample.t_arrival_ns):
+    def _expire_zero(self, t_ns: int) -> None:
+        """End a request for which a sample that arrives then is too late; the estimator gives up by the same time."""
+        if self._zero is not None and self._zero.is_too_late(t_ns):
             self._zero.expire(self._not_taken(self._zero_timeout_s))
             structlog.get_logger().warning(self._zero.reason)
 
@@ -164,11 +164,15 @@ class SkinTask:
 
     def diagnostics(self) -> Diagnostics:
         """Return the values of voltages, zero and force for `health`."""
+        # Also where no sample comes.
+        self._expire_zero(self._clock.now_ns())
         zero, voltages = self._estimator.zero, self._skin.diagnostics()
+        request = self._zero
+        why_no_zero = request.reason if request is not None and request.state is ZeroState.EXPIRED else ""
         return {
             **voltages,
             "valid": self._valid,
-            "error": self._reason or self._drift_warning or str(voltages.get("last_refusal", "")),
+            "error": self._reason or why_no_zero or self._drift_warning or str(voltages.get("last_refusal", "")),
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,

@@ -896,6 +896,19 @@ def test_a_second_stop_says_what_the_first_one_stopped(reply, happens):
     assert _lines("stop", reply) == [f"stop: nothing was moving; {happens}"]
 
 
+@pytest.mark.parametrize(
+    ("lost", "without"),
+    [
+        ([], ""),
+        (["left"], "; NOT of left, which is not connected"),
+        (["left", "combined"], "; NOT of left, combined, which are not connected"),
+    ],
+)
+def test_an_accepted_tare_names_the_sensors_without_one(lost, without):
+    (line,) = _lines("tare", {"taring": ["right"], "not_connected": lost})
+    assert line.startswith(f"tare: the zero of right is being taken{without}; `shearloop command status`")
+
+
 def test_a_stop_imports_little():
     """On a busy computer, imports are most of the time that `shearloop command stop` takes."""
     says = """if True:

@@ -20,7 +20,8 @@ const SHOWN_MS = 8000;
 // What an accepted command does, in words; a tare ends some seconds later.
 function outcome(name, { taring, not_connected: lost = [] }) {
   if (name !== "tare") return `${name}: done`;
-  const without = lost.length ? `; NOT of ${lost.join(", ")}, which is not connected` : "";
+  const are = lost.length > 1 ? "are" : "is";
+  const without = lost.length ? `; NOT of ${lost.join(", ")}, which ${are} not connected` : "";
   return `tare: the zero of ${taring.join(", ")} is being taken${without}`;
 }
 

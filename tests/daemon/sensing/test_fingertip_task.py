@@ -3,7 +3,7 @@
 import asyncio
 import threading
 from collections.abc import AsyncGenerator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
@@ -14,14 +14,17 @@ from structlog.testing import capture_logs
 from shearloop.bank.channels import PAPER_TABLE
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.control.finger_motion import FingerMotion
+from shearloop.daemon.messaging.command_server import CommandRefusedError
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.sensing.fingertip_boards import BoardTask, CombinedTask, DeadElectrodes
 from shearloop.daemon.sensing.fingertip_task import FingertipTask, tactile_frame
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.daemon.sensing.session_inputs import session_inputs
 from shearloop.daemon.sensing.sessions import COMBINED
+from shearloop.daemon.supervisor import HealthReporter, Supervisor
 from shearloop.daemon.torques import TorqueSample
 from shearloop.drivers.defaults import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import Frame
@@ -172,7 +175,7 @@ def resting_gripper() -> SimpleNamespace:
 
 def pairs(publisher: RecordingPublisher) -> CombinedTask:
     pairing = FramePairing(("right", "left"), PERIOD_S)
-    return CombinedTask(COMBINED, FakeSession(), publisher, Clock(), period_s=PERIOD_S, pairing=pairing)
+    return CombinedTask(COMBINED, FakeSession(), publisher, Clock(), period_s=PERIOD_S, pairing=pairing, boards={})
 
 
 def fingertip(
@@ -540,6 +543,61 @@ async def test_a_tare_that_lost_its_board_on_the_way_gives_no_estimate_until_the
     assert session.given_up == 1
     assert [tare_in(one) for one in raw] == [(0, "begins"), (1, "given up")], "as a replay finds it"
     assert log.said == ["the idle frame of right was not taken: 1 frame: nothing"]
+
+
+@dataclass
+class Plug:
+    """A board that sends nothing, plugged in or not."""
+
+    connected: bool = True
+
+    def diagnostics(self) -> dict[str, Any]:
+        loss = "" if self.connected else "Its cable is out."
+        return {"connected": self.connected, "last_loss": loss, "last_refusal": "", "measured_hz": None}
+
+
+def two_and_both(right: Plug, left: Plug, clock: Clock) -> dict[str, FingertipTask]:
+    """Return the tasks of two fingertips and of their pairs."""
+    publisher, pairing = RecordingPublisher(), FramePairing(("right", "left"), PERIOD_S)
+    boards = {"right": right, "left": left}
+    both = CombinedTask(COMBINED, FakeSession(), publisher, clock, period_s=PERIOD_S, pairing=pairing, boards=boards)
+    alone = {name: BoardTask(name, FakeSession(), publisher, clock, board=board) for name, board in boards.items()}
+    return {**alone, COMBINED: both}
+
+
+async def test_no_zero_of_both_fingertips_is_taken_without_one_of_them():
+    right, left, clock = Plug(), Plug(connected=False), FixedClock()
+    tasks = two_and_both(right, left, clock)
+    health = HealthReporter(RecordingPublisher(), Supervisor(), clock, reporters=tasks)
+    sensors = SimpleNamespace(tareable=tasks)
+    tare = Commands(None, sensors, None, health, asyncio.Event(), lambda **_: None).handlers()["tare"]
+    assert await tare({}) == {"taring": ["right"], "not_connected": ["left", COMBINED]}
+    assert not tasks[COMBINED].taring, "a start waits for no zero that cannot be taken"
+    assert tasks[COMBINED].diagnostics()["error"] == "without left there is no combined estimate"
+    with pytest.raises(CommandRefusedError, match=r"^not connected: combined; connect it, then"):
+        await tare({"source": COMBINED})
+    right.connected = False
+    with pytest.raises(CommandRefusedError, match=r"^not connected: right and left and combined; connect them, then"):
+        await tare({})
+    right.connected = left.connected = True
+    assert await tare({}) == {"taring": ["right", "left", COMBINED]}
+
+
+@pytest.mark.parametrize("name", ["right", COMBINED])
+async def test_a_tare_that_no_frame_comes_for_ends_in_log_and_status(name, log):
+    right, clock = Plug(), FixedClock()
+    task = two_and_both(right, Plug(), clock)[name]
+    task.tare()
+    # It is unplugged on the way.
+    right.connected = False
+    assert "idle frame" not in task.diagnostics()["error"]
+    clock.t_ns += round(task.longest_tare_s * 1e9) + 1
+    why = f"the idle frame of {name} was not taken: no frame came in time"
+    for _ in range(2):
+        assert task.diagnostics()["error"].startswith(f"{why}; ")
+    assert log.said == [why]
+    task.tare()
+    assert why not in task.diagnostics()["error"]
 
 
 @pytest.mark.parametrize(("complete", "said"), [(False, [True]), (False, [False, True]), (True, [None, True])])

@@ -109,6 +109,19 @@ async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypat
         assert board.tares == [], "nor at whatever load comes later"
 
 
+async def test_a_zero_of_a_board_that_is_gone_ends_in_log_and_status(log):
+    clock = SimpleNamespace(t_ns=10**9)
+    clock.now_ns = lambda: clock.t_ns
+    async with reading(clock=clock) as (task, board):
+        task.tare()
+        board.diagnostics = lambda: {"connected": False, "last_loss": "Its cable is out.", "last_refusal": ""}
+        clock.t_ns += round(ZERO_TIMEOUT_S * 1e9) + 1
+        why = "the load cell's zero could not be taken within 15 s: Its cable is out"
+        for _ in range(2):
+            assert task.diagnostics()["error"] == why
+        assert log.said == [why]
+
+
 async def test_a_zero_of_a_board_that_is_gone_says_why_it_is_gone():
     async with reading() as (task, board):
         gone = {"connected": False, "last_loss": "There is no serial port /dev/load.", "last_refusal": ""}

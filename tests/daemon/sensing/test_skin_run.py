@@ -4,13 +4,16 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import yaml
 
 from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import SkinConfig
 from shearloop.daemon.control.action_executor import tare_all
+from shearloop.daemon.sensing.skin_task import SkinTask, zero_timeout_s
 from shearloop.emulators.skin import SkinInstruments
 from shearloop.emulators.synthetic_skin import SyntheticSkin
 from shearloop.errors import ActionError
@@ -231,6 +234,20 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
         assert "gauge 2 is open" in why
         assert (await bench.command("tare", source="skin"))["ok"]
         await bench.valid()
+
+
+async def test_a_zero_that_no_sample_comes_for_ends_in_log_and_status(log):
+    config = SkinConfig.model_validate(section(ADC))
+    clock = SimpleNamespace(t_ns=10**9)
+    clock.now_ns = lambda: clock.t_ns
+    skin = SkinTask(config, SimpleNamespace(), clock)
+    skin.tare()
+    assert skin.diagnostics()["error"] == ""
+    clock.t_ns += round(zero_timeout_s(config) * 1e9) + 1
+    why = f"the skin's zero could not be taken within {zero_timeout_s(config):.3g} s: nothing came"
+    for _ in range(2):
+        assert skin.diagnostics()["error"] == why
+    assert log.said == [why]
 
 
 async def test_a_drift_that_two_zeros_show_is_said_in_status_and_log(tmp_path, monkeypatch, log):

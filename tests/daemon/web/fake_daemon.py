@@ -61,7 +61,10 @@ PLAN = [
     "   1  grip  closes the fingers",
     "   2  loosen  clockwise by up to 0.3 N·m",
 ]
-REPLIES = {"stop": {"stopped": "hold 0.10 N·m"}, "tare": {"taring": ["right", "load_cell"], "not_connected": ["left"]}}
+REPLIES = {
+    "stop": {"stopped": "hold 0.10 N·m"},
+    "tare": {"taring": ["right", "load_cell"], "not_connected": ["left", "combined"]},
+}
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "release", "stop")
 
 

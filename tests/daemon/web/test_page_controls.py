@@ -54,7 +54,7 @@ LONG_TIMERS = """() => {
   };
 }"""
 
-TARED = "tare: the zero of right, load_cell is being taken; NOT of left, which is not connected"
+TARED = "tare: the zero of right, load_cell is being taken; NOT of left, combined, which are not connected"
 
 
 def test_stop_needs_no_token_and_motion_does(browsed):

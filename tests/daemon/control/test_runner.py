@@ -256,7 +256,7 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
 
 
 REFUSED_ONLY_BY_THE_EXPERIMENT = {
-    "a tool would drop": ([{"do": "release"}], {}, "secure it, then confirm it"),
+    "a tool would drop": ([{"do": "release"}], {}, "secure it, then send the same command with `--yes`"),
     "a move with a held tool": ([MOVE], {}, "put a `grip` or a `release` before step 1"),
     "a torque beyond its limit": ([TWIST], {"limits": {"torque_nm": 0.05}}, "measured"),
 }
@@ -291,7 +291,7 @@ async def test_what_refuses_a_start_while_the_arm_is_enabled_begins_nothing():
         cell.holding = True
         while not starting.done():
             await cell.cycles(1)
-        assert "secure it, then confirm it" in starting.result()
+        assert "secure it, then send the same command with `--yes`" in starting.result()
         assert cell.control_loop.experiment is None
 
 

@@ -103,13 +103,10 @@ def build_sensors(
         return SerialLink(**device.model_dump(), monitor=LinkMonitor(LinkReporter(name, loop)))
 
     patience = patience_of(config)
-    boards = {
-        name: EitKit(
-            link(name, config.fingertips[name].device), session.calibration.table.zero_slots,
-            config.fingertips[name].frame_period_s, inputs(name), patience,
-        )
-        for name, session in sessions.fingertips.items()
-    }  # fmt: skip
+    boards: dict[str, EitKit] = {}
+    for name, session in sessions.fingertips.items():
+        own, zero_slots = config.fingertips[name], session.calibration.table.zero_slots
+        boards[name] = EitKit(link(name, own.device), zero_slots, own.frame_period_s, inputs(name), patience)
     pairs: CombinedTask | None = None
     if (combined := sessions.combined) is not None:
         sides = combined.calibration.sides
@@ -117,8 +114,7 @@ def build_sensors(
         pairs = CombinedTask(
             COMBINED, combined, publisher, clock, loop, gripper, inputs(COMBINED),
             longest_tare_s=_longest_tare_s(config.fingertips[sides[0]]),
-            period_s=period_s, pairing=FramePairing(sides, period_s), sides=[inputs(side) for side in sides],
-            boards={side: boards[side] for side in sides},
+            period_s=period_s, pairing=FramePairing(sides, period_s), boards={side: boards[side] for side in sides},
         )  # fmt: skip
     tasks: dict[str, Task] = {}
     tareable: dict[str, Tareable] = {}

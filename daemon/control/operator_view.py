@@ -30,12 +30,6 @@ CLAMPED_CURE = (
     "nothing loads it, `shearloop command release --yes` lets its angle count from 0"
 )
 
-# The way to a zero where the gripper does not know whether it holds a tool.
-MAKE_KNOWN = (
-    "look, and secure a tool that is there: `shearloop command release --yes` opens the gripper, which then knows that "
-    "it is empty; if it holds nothing, confirm the zero with `shearloop command tare --yes`"
-)
-
 # A width that is asked for may be one count of the gripper, at most 0.7 mm, from the one that is reached.
 SAME_WIDTH_MM = 1.0
 
@@ -88,7 +82,8 @@ class OperatorView:
         if confirmed:
             return None
         if (uncertain := self.tool.uncertain) is not None:
-            return f"{uncertain}; {MAKE_KNOWN}"
+            release = "look, and secure a tool: `shearloop command release --yes` opens the gripper and makes it known"
+            return f"{uncertain}; {release}; if it holds nothing, confirm it with `shearloop command tare --yes`"
         if (loaded := self._load()) is not None:
             return f"{loaded.sentence}, which would become the zero; {loaded.cure}"
         if turned := self._turned():

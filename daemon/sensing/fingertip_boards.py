@@ -16,7 +16,6 @@ from shearloop.daemon.sensing.fingertip_task import FingertipTask
 from shearloop.daemon.sensing.frame_pairing import FramePairing
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.drivers.serial_sensor import InputRecorder
 from shearloop.words import counted
 
 
@@ -24,13 +23,12 @@ from shearloop.words import counted
 class CombinedTask(FingertipTask):
     """Pairs the frames of several fingertips, which their boards' tasks add, and estimates from each pair.
 
-    `sides` are the recorders of the boards' inputs. It is connected while all of its `boards` are.
+    It is connected while all of its `boards` are.
     """
 
     period_s: float
     pairing: FramePairing[Frame]
     boards: Mapping[str, EitKit]
-    sides: Sequence[InputRecorder | None] = ()
     _pairs: deque[tuple[Frame, ...]] = field(default_factory=deque)
     _in_order: asyncio.Lock = field(default_factory=asyncio.Lock)
     # The frames without a partner since the last pair.
@@ -81,7 +79,8 @@ class CombinedTask(FingertipTask):
 
     def _record_own_state(self) -> None:
         # A pair has frames of several boards: the replay of all of them must have begun.
-        if self.wants_state and not any(side is not None and side.wants_state for side in self.sides):
+        sides = [board.inputs for board in self.boards.values()]
+        if self.wants_state and not any(side is not None and side.wants_state for side in sides):
             self.record_state({"pairing": self.pairing, "pairs": self._pairs})
 
     def diagnostics(self) -> Diagnostics:
@@ -93,7 +92,7 @@ class CombinedTask(FingertipTask):
             "expected_hz": 1.0 / self.period_s,
             "estimates": self.count,
             "unpaired": dict(self.pairing.unpaired),
-            "error": "; ".join(filter(None, (self.why_no_zero(), loss or self._unpaired_sentence))),
+            "error": "; ".join(filter(None, (self.why_no_zero(self.clock.now_ns()), loss or self._unpaired_sentence))),
         }
 
 
@@ -161,6 +160,6 @@ class BoardTask(FingertipTask):
         return {
             **board,
             "rate_hz": board["measured_hz"],
-            "error": "; ".join(str(error) for error in (self.why_no_zero(), *errors) if error),
+            "error": "; ".join(str(error) for error in (self.why_no_zero(self.clock.now_ns()), *errors) if error),
             "estimates": self.count,
         }

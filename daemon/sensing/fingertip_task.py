@@ -169,10 +169,10 @@ class FingertipTask:
 
         Return whether the session's tare begins before the frame, and whether it is given up.
         """
-        self._expire_zero(began_ns)
         zero = self._zero
         if zero is None:
             return False, False
+        self.why_no_zero(began_ns)
         begins = zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns
         if begins:
             zero.collect()
@@ -180,19 +180,12 @@ class FingertipTask:
         # Later frames could be of any load.
         return begins, zero.state is ZeroState.EXPIRED and self.session.taring
 
-    def _expire_zero(self, t_ns: int) -> None:
-        """End a request for an idle frame for which a frame that begins then is too late."""
+    def why_no_zero(self, t_ns: int) -> str:
+        """End a request for which this time is too late; return why the latest one has no idle frame, else nothing."""
         if self._zero is not None and self._zero.is_too_late(t_ns):
             why = self._refused_frames or "no frame came in time"
             self._zero.expire(f"the idle frame of {self.name} was not taken: {why}")
             structlog.get_logger().warning(self._zero.reason)
-
-    def why_no_zero(self) -> str:
-        """Return why the latest request for an idle frame ended without one; empty if it did not.
-
-        A request ends in time also where no frame comes.
-        """
-        self._expire_zero(self.clock.now_ns())
         return self._zero.reason if self._zero is not None else ""
 
     def _refuse_held_tool(self, *, taring: bool) -> bool:

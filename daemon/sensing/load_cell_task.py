@@ -10,7 +10,7 @@ import structlog
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest
+from shearloop.daemon.sensing.zero_request import ZERO_TIMEOUT_S, ZeroRequest, ZeroState
 from shearloop.daemon.torques import LOAD_CELL, SensorListener, TorqueSample, load_of
 from shearloop.drivers.connection import Diagnostics
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
@@ -103,19 +103,16 @@ class LoadCellTask:
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`."""
-        # Also where no reading comes.
         self._expire_zero(self._clock.now_ns())
         found = self._board.diagnostics()
-        own = str(found["last_refusal"])
+        own, zero = found["last_refusal"], self._zero
         if self._latest is not None and self._latest.other_unit is not None:
             own = self._latest.other_unit.clause
-        why_no_zero = self._zero.reason if self._zero is not None else ""
-        error = why_no_zero or own
-        if not found["connected"]:
-            loss = str(found["last_loss"])
-            # The reason may end with the same loss.
-            said = loss.removesuffix(".") in why_no_zero
-            error = why_no_zero if said else "; ".join(filter(None, (why_no_zero, loss)))
+        if zero is not None and zero.reason:
+            own = zero.reason
+        # The reason of an expired request names the loss.
+        shows_own = found["connected"] or (zero is not None and zero.state is ZeroState.EXPIRED)
+        error = own if shows_own else found["last_loss"]
         return {**found, "expected_hz": 1.0 / self._period_s, "error": error}
 
     def _not_taken(self, zero: ZeroRequest, within_s: float) -> str:
@@ -130,11 +127,9 @@ class LoadCellTask:
         return f"the load cell's zero could not be taken within {within_s:.3g} s: {reason}"
 
     def _take_zero(self, sample: LoadSample) -> None:
+        self._expire_zero(sample.t_arrival_ns)
         zero = self._zero
         if zero is None or not zero.is_open:
-            return
-        self._expire_zero(sample.t_arrival_ns)
-        if not zero.is_open:
             return
         if sample.trusted and sample.t_mid_ns >= zero.from_ns:
             zero.collect()
@@ -143,7 +138,7 @@ class LoadCellTask:
             self._end_zero(zero, self._raw)
 
     def _expire_zero(self, t_ns: int) -> None:
-        """End a request for a zero for which a reading that arrives then is too late."""
+        """End a request for a zero for which this time is too late, also where no reading comes."""
         if self._zero is not None and self._zero.is_too_late(t_ns):
             self._zero.expire(self._not_taken(self._zero, self._timeout_s))
             structlog.get_logger().warning(self._zero.reason)

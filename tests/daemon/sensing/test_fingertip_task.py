@@ -328,7 +328,8 @@ async def test_a_busy_fingertip_keeps_no_other_state_from_a_recording():
     states = list[dict[str, Any]]()
     publisher, slow, combined = RecordingPublisher(3), FakeSession(waits=0), pairs(RecordingPublisher())
     right, left, both = Inputs(states), Inputs(states), Inputs(states)
-    combined.inputs, combined.sides = both, (right, left)
+    combined.inputs = both
+    combined.boards = {name: SimpleNamespace(inputs=own) for name, own in (("right", right), ("left", left))}
     # A read that completes no frame comes before the first one that a file has.
     busy = BoardTask("right", slow, publisher, Clock(), inputs=right, board=Reads([frame(0)], []), combined=combined)
     idle = BoardTask("left", FakeSession(), publisher, Clock(), inputs=left, board=Reads([]), combined=combined)

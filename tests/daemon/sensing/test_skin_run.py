@@ -334,7 +334,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section(ADC, tool_radius_mm=None), "robot": ROBOT, "experiment": HOLDS},
-            "torque_source: `skin` has no torque without a radius: add `skin.tool_radius_mm`, or choose another",
+            "torque_source: `skin` has no torque without a radius: add `skin.tool_radius_mm`; no other can drive",
         ),
         ({"skin": section(ADC, calibration="none.yaml")}, "none.yaml: the calibration cannot be read: No such file"),
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),

@@ -1,20 +1,19 @@
-"""Characters that look like another one, or like nothing, and what is meant by them in a YAML file."""
+"""Lookalikes: invisible characters, and characters that look like one of ASCII, with their replacements in YAML."""
 
 import unicodedata
 from typing import Final
 
 # As chat programs, word processors and keyboards of other scripts write them.
-_MEANT: Final = {
+_REPLACEMENTS: Final = {
     **dict.fromkeys("“”„‟«»″＂", '"'),
     **dict.fromkeys("‘’‚‛′＇", "'"),
     **dict.fromkeys("‐‑‒–—―−•·‣▪－", "-"),
     **{"：": ":", "，": ",", "［": "[", "］": "]", "｛": "{", "｝": "}", "．": ".", "＃": "#"},
 }
-_NAMES: Final = {" ": "a space"}
 
 
-def meant_by(character: str) -> str | None:
-    """Return what is meant by a character, None by one that stands for itself; an empty text: it does not belong."""
+def replacement_of(character: str) -> str | None:
+    """Return the ASCII character that replaces a lookalike, empty for an invisible one; None for other characters."""
     if character.isascii():
         return None
     match unicodedata.category(character):
@@ -22,31 +21,33 @@ def meant_by(character: str) -> str | None:
             return " "
         case "Cf" | "Cc":
             return ""
-    return _MEANT.get(character)
+    return _REPLACEMENTS.get(character)
 
 
 def first_lookalike(text: str) -> int | None:
-    """Return the index of the first such character of a text, None without one."""
-    return next((index for index, character in enumerate(text) if meant_by(character) is not None), None)
+    """Return the index of the first lookalike in a text, None without one."""
+    return next((index for index, character in enumerate(text) if replacement_of(character) is not None), None)
 
 
-def with_what_is_meant(text: str) -> str:
-    """Return a text with what is meant by each of its characters."""
-    return "".join(character if (meant := meant_by(character)) is None else meant for character in text)
+def without_lookalikes(text: str) -> str:
+    """Return a text with each lookalike replaced."""
+    replacements = ((character, replacement_of(character)) for character in text)
+    return "".join(character if replacement is None else replacement for character, replacement in replacements)
 
 
-def described(character: str) -> str:
-    """Return the name of such a character, and its cure."""
-    meant = meant_by(character)
-    cure = f"write {_NAMES.get(meant, meant)} instead" if meant else "take it out"
-    name = unicodedata.name(character, "a control character").lower()
-    return f"U+{ord(character):04X} ({name}) stands here; {cure}"
+def describe(lookalike: str) -> str:
+    """Return the code and the name of a lookalike, and the cure."""
+    replacement = replacement_of(lookalike)
+    written = "a space" if replacement == " " else replacement
+    cure = f"write {written} instead" if written else "take it out"
+    name = unicodedata.name(lookalike, "a control character").lower()
+    return f"U+{ord(lookalike):04X} ({name}) stands here; {cure}"
 
 
 def note_on(text: str) -> str:
-    """Return the end of a sentence on the first such character of a text, or an empty text."""
+    """Return a clause on the first lookalike in a text, empty without one."""
     index = first_lookalike(text)
     if index is None:
         return ""
     before = f"behind {text[:index]!r}" if index else "at the beginning"
-    return f"; {before}, {described(text[index])}"
+    return f"; {before}, {describe(text[index])}"

@@ -10,7 +10,7 @@ import yaml
 
 from shearloop.binary_files import IN_UTF_16, is_utf_16
 from shearloop.files import read_file
-from shearloop.lookalikes import described, first_lookalike, with_what_is_meant
+from shearloop.lookalikes import describe, first_lookalike, without_lookalikes
 from shearloop.mistakes import keys_of
 from shearloop.words import counted
 from shearloop.yaml_loader import MAX_BYTES, MISREAD, parse_yaml
@@ -114,7 +114,7 @@ def _place(text: str, index: int) -> str:
 def _lookalike(text: str, index: int) -> tuple[str, str]:
     """Return the place and the words for the first character from an index on that looks like another one."""
     index += first_lookalike(text[index:]) or 0
-    return _place(text, index), described(text[index])
+    return _place(text, index), describe(text[index])
 
 
 def _cured(lines: Sequence[str], error: yaml.MarkedYAMLError, mark: yaml.Mark) -> tuple[str, str] | None:
@@ -137,7 +137,7 @@ def _cured(lines: Sequence[str], error: yaml.MarkedYAMLError, mark: yaml.Mark) -
 def _cures_of(line: str) -> Iterator[tuple[int, str, str]]:
     """Yield other spellings of a line: the column where it differs, the line, and the words for what was wrong."""
     if (column := first_lookalike(line)) is not None:
-        yield column, with_what_is_meant(line), described(line[column])
+        yield column, without_lookalikes(line), describe(line[column])
     for cure in _CURES:
         if found := cure.wrong.search(line):
             column = found.end("key") if "key" in cure.wrong.groupindex else found.start()

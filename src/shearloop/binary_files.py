@@ -1,8 +1,10 @@
 """What a file without text is, by its first bytes, and which command reads it."""
 
+import codecs
 from typing import Final
 
-SAVED_AS_UTF_8: Final = "save the file with the encoding UTF-8"
+_SAVE_AS_UTF_8: Final = "save the file with the encoding UTF-8"
+IN_UTF_16: Final = f"the file is text in UTF-16, and not in UTF-8; {_SAVE_AS_UTF_8}"
 FIRST_BYTES: Final = {
     b"PK\x03\x04": "a calibration, which `shearloop evaluate` reads, or another archive",
     b"\x8eSHLBANK": "a bank, which `shearloop bank info` reads",
@@ -11,20 +13,19 @@ FIRST_BYTES: Final = {
 }
 
 
-# The marks of byte order that a text in UTF-16 may begin with.
-_BYTE_ORDERS: Final = (b"\xff\xfe", b"\xfe\xff")
-IN_UTF_16: Final = f"the file is text in UTF-16, and not in UTF-8; {SAVED_AS_UTF_8}"
-
-
 def is_utf_16(data: bytes) -> bool:
-    """Return whether a file is text in UTF-16: of ASCII characters, every second byte is 0."""
-    return data.startswith(_BYTE_ORDERS) or data[:8].count(0) == len(data[:8]) / 2 > 0
+    """Return whether a file is text in UTF-16: it has a byte order mark, or half of its first bytes are 0."""
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return True
+    # One byte of each ASCII character is 0.
+    first = data[:8]
+    return bool(first) and 2 * first.count(0) == len(first)
 
 
 def why_no_text(data: bytes, at: int, what: str) -> str:
-    """Return the place in a file with these bytes, and why it is no text; `at` is its first byte that is none.
+    """Return why a file with these bytes is no text in UTF-8, as the end of a message that begins with its path.
 
-    Both follow the path of the file, which is meant as a `what`.
+    `at` is the index of the first wrong byte, and `what` the kind of file that is expected.
     """
     for first, kind in FIRST_BYTES.items():
         if data.startswith(first):
@@ -37,4 +38,4 @@ def why_no_text(data: bytes, at: int, what: str) -> str:
     meant = data[at : at + 1].decode("cp1252", "replace")
     if meant.isprintable() and meant != "\ufffd":
         found += f", and would be {meant} in Windows-1252"
-    return f":{line}:{column}: {found}; {SAVED_AS_UTF_8}"
+    return f":{line}:{column}: {found}; {_SAVE_AS_UTF_8}"

@@ -58,9 +58,9 @@ class Parser(argparse.ArgumentParser):
             of_type = isinstance(error.__context__, argparse.ArgumentTypeError)
             self._refuse(f"{error.argument_name}{'' if of_type else ':'} {error.message}")
         if extras:
-            from shearloop.cli.mistyped import of_extra_words
+            from shearloop.cli.argument_mistakes import unknown_arguments
 
-            self._refuse(of_extra_words(extras, self._option_string_actions))
+            self._refuse(unknown_arguments(extras, self._option_string_actions))
         for action in self._actions:
             # The types of options that name an output look at the inputs.
             if (check := getattr(action.type, "check", None)) is not None:
@@ -69,16 +69,16 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Raise UserError with argparse's sentence, and with the choices for each missing word that it names."""
-        from shearloop.cli.mistyped import of_missing_words
+        from shearloop.cli.argument_mistakes import missing_arguments
 
-        self._refuse(of_missing_words(message, self._actions))
+        self._refuse(missing_arguments(message, self._actions))
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         """Refuse a value that is not among the choices, with the nearest one."""
         if action.choices is not None and value not in action.choices:
-            from shearloop.cli.mistyped import of_value
+            from shearloop.cli.argument_mistakes import unknown_choice
 
-            self._refuse(of_value(action, value))
+            self._refuse(unknown_choice(action, value))
 
     def _refuse(self, sentence: str) -> NoReturn:
         raise UserError(f"{sentence}; see `{self.prog} --help`")

@@ -1,4 +1,4 @@
-"""What the command line says of words that it does not know, or that are missing."""
+"""Sentences on arguments of the command line that are unknown or missing."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -11,15 +11,15 @@ from shearloop.cli.registry import COMMANDS, MOVING
 _OF_COMMAND = (MOVING - COMMANDS.keys()) | {"tare"}
 
 
-def of_extra_words(extras: Sequence[str], options: Iterable[str]) -> str:
-    """Return a sentence on words that no argument takes, with the option that is nearest to the first."""
+def unknown_arguments(extras: Sequence[str], options: Iterable[str]) -> str:
+    """Return a sentence on unknown arguments, with the option that is nearest to the first."""
     near = get_close_matches(extras[0].partition("=")[0], options, 1)
     meant = f"; did you mean {near[0]}?" if near else ""
     return f"unrecognized arguments: {' '.join(extras)}{meant}"
 
 
-def of_missing_words(message: str, actions: Sequence[argparse.Action]) -> str:
-    """Return argparse's sentence with the choices for each missing word that it names."""
+def missing_arguments(message: str, actions: Sequence[argparse.Action]) -> str:
+    """Return argparse's sentence with the choices of each missing argument that it names."""
     words = message.replace(",", " ").split()
     lists = [
         f"; {action.metavar or action.dest} is one of {', '.join(map(str, action.choices))}"
@@ -29,7 +29,7 @@ def of_missing_words(message: str, actions: Sequence[argparse.Action]) -> str:
     return message + "".join(lists)
 
 
-def of_value(action: argparse.Action, value: Any) -> str:
+def unknown_choice(action: argparse.Action, value: Any) -> str:
     """Return a sentence on a value that is not among an argument's choices, with the nearest one."""
     known = list(map(str, action.choices or ()))
     if value in _OF_COMMAND and "command" in known:

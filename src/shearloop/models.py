@@ -37,7 +37,7 @@ def booleans_as_text(content: object, types: Mapping[str, Any]) -> object:
     """
     if not isinstance(content, Mapping):
         return content
-    return {key: _booleans_as_text(value) if _is_number(types.get(key)) else value for key, value in content.items()}
+    return {key: _as_text(value) if _is_number(types.get(key)) else value for key, value in content.items()}
 
 
 def _is_number(annotation: Any) -> bool:
@@ -49,7 +49,8 @@ def _holds(annotation: Any, kind: type) -> bool:
     return annotation is kind or any(_holds(one, kind) for one in get_args(annotation))
 
 
-def _booleans_as_text(value: object) -> object:
+def _as_text(value: object) -> object:
+    """Return a boolean, or each one in a list, as text."""
     if isinstance(value, list):
-        return [_booleans_as_text(one) for one in value]
+        return [_as_text(one) for one in value]
     return str(value).lower() if isinstance(value, bool) else value

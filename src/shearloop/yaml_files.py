@@ -1,7 +1,7 @@
 """YAML files: read with unique keys, checked by pydantic, and replaced at once when written.
 
 Each caller names the exception to raise. Its message has a line for each mistake: `file:line: key: the mistake;
-allowed: …; did you mean …?`. The modules that tell mistakes are imported where one is told.
+allowed: …; did you mean …?`. Modules that describe mistakes are imported where one occurs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -84,9 +84,9 @@ class Document:
             raise self.raises(f"{self.path}: expected keys and values such as `{first_key(model)}: …`")
         content, folder = self.content, self.path.resolve().parent
         if self._given:
-            from shearloop.replaced_values import with_expected_texts
+            from shearloop.yaml_overrides import with_texts_as_written
 
-            content = with_expected_texts(content, self._given, model, folder)
+            content = with_texts_as_written(content, self._given, model, folder)
         try:
             return as_model(content, model, folder)
         except ValidationError as error:
@@ -100,7 +100,7 @@ class Document:
 
         Mistakes in the result are named without a line.
         """
-        from shearloop.replaced_values import with_values
+        from shearloop.yaml_overrides import with_values
 
         content, given = with_values(self.content, values, self.path, self.raises)
         return type(self)(self.path, content, self.raises, None, {**self._given, **given})

@@ -10,7 +10,7 @@ import yaml
 MAX_BYTES, _MAX_VALUES = 1 << 17, 20_000
 
 
-# Meant in no key and no value: characters without width, other blanks at an end, and typographic quotes around it all.
+# Never intended in a key or a value: characters without width, other blanks at an end, typographic quotes around it.
 _BLANK = "[\xa0\u1680\u2000-\u200a\u202f\u205f\u3000]"
 _MISREAD = re.compile(rf"[\xad\u200b\u2060\ufeff]|^{_BLANK}|{_BLANK}$|^[“”„‟«‘’‚].*[“”‟»‘’]$", re.DOTALL)
 MISREAD = "a character looks like another one, or like none"

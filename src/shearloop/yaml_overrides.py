@@ -1,4 +1,4 @@
-"""Replaces values of a YAML file's content, as `--set loop.kp=2` does."""
+"""Overrides values of a YAML file, as `--set loop.kp=2` does."""
 
 import copy
 from collections.abc import Callable, Mapping
@@ -36,10 +36,10 @@ def with_values(
     return content, given
 
 
-def with_expected_texts(content: Any, given: Mapping[Place, str], model: type[Any], folder: Path) -> Any:
-    """Return the content with the values that were given as they were written, where the model expects a text.
+def with_texts_as_written(content: Any, given: Mapping[Place, str], model: type[Any], folder: Path) -> Any:
+    """Return the content with each overridden value as it was written, where the model expects a text.
 
-    A shell takes the quotes of a text away.
+    A shell takes the quotes of a text away. `given` has the values as they were written, by their places.
     """
     left = dict(given)
     while left:

@@ -295,8 +295,10 @@ def experiment_mistakes(
     limits, cap = (robot.settings.limits, robot.cap) if robot is not None else (None, None)
     mistakes = check_steps(file, cap)
     mistakes += check_devices(file, limits, config.gripper_model, cap)
-    if file.torque_source and needs:
-        named = isinstance(content, dict) and "torque_source" in content
+    named = isinstance(content, dict) and "torque_source" in content
+    of_rig = {*config.fingertips, *sources, WRENCH} | ({"skin"} if config.skin is not None else set())
+    # The default may be no source of this rig. A written name that is none is misspelt.
+    if file.torque_source and (needs or (named and file.torque_source not in of_rig)):
         mistakes += _undriven(file, sources, config, robot, named=named)
     if file.torque_source in sources:
         mistakes += [(("steps", number), why) for number, why in not_measured(file, sources[file.torque_source])]

@@ -85,14 +85,17 @@ class CombinedTask(FingertipTask):
 
     def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
+        # Also where no pair comes.
+        self.expire_zero(self.clock.now_ns())
         lost = [side for side, board in self.boards.items() if not board.diagnostics()["connected"]]
         loss = f"without {' and '.join(lost)} there is no combined estimate" if lost else ""
+        errors = (self.why_no_zero, loss or self._unpaired_sentence)
         return {
             "connected": not lost,
             "expected_hz": 1.0 / self.period_s,
             "estimates": self.count,
             "unpaired": dict(self.pairing.unpaired),
-            "error": "; ".join(filter(None, (self.why_no_zero(self.clock.now_ns()), loss or self._unpaired_sentence))),
+            "error": "; ".join(filter(None, errors)),
         }
 
 
@@ -155,11 +158,17 @@ class BoardTask(FingertipTask):
 
     def diagnostics(self) -> Diagnostics:
         """Return the values for the health message."""
+        # Also where no frame comes.
+        self.expire_zero(self.clock.now_ns())
         board = self.board.diagnostics()
-        errors = (self.dead_electrodes.sentence, board["last_refusal"]) if board["connected"] else (board["last_loss"],)
+        errors = [self.why_no_zero]
+        if board["connected"]:
+            errors += [self.dead_electrodes.sentence, str(board["last_refusal"])]
+        else:
+            errors.append(str(board["last_loss"]))
         return {
             **board,
             "rate_hz": board["measured_hz"],
-            "error": "; ".join(str(error) for error in (self.why_no_zero(self.clock.now_ns()), *errors) if error),
+            "error": "; ".join(filter(None, errors)),
             "estimates": self.count,
         }

@@ -172,7 +172,7 @@ class FingertipTask:
         zero = self._zero
         if zero is None:
             return False, False
-        self.why_no_zero(began_ns)
+        self.expire_zero(began_ns)
         begins = zero.state is ZeroState.REQUESTED and began_ns >= zero.from_ns
         if begins:
             zero.collect()
@@ -180,12 +180,15 @@ class FingertipTask:
         # Later frames could be of any load.
         return begins, zero.state is ZeroState.EXPIRED and self.session.taring
 
-    def why_no_zero(self, t_ns: int) -> str:
-        """End a request for which this time is too late; return why the latest one has no idle frame, else nothing."""
-        if self._zero is not None and self._zero.is_too_late(t_ns):
+    def expire_zero(self, t_ns: int) -> None:
+        """End a request for an idle frame for which this time is too late."""
+        if self._zero is not None:
             why = self._refused_frames or "no frame came in time"
-            self._zero.expire(f"the idle frame of {self.name} was not taken: {why}")
-            structlog.get_logger().warning(self._zero.reason)
+            self._zero.expire_if_late(t_ns, lambda: f"the idle frame of {self.name} was not taken: {why}")
+
+    @property
+    def why_no_zero(self) -> str:
+        """Why the latest request got no idle frame, or an empty text."""
         return self._zero.reason if self._zero is not None else ""
 
     def _refuse_held_tool(self, *, taring: bool) -> bool:

@@ -139,9 +139,8 @@ class LoadCellTask:
 
     def _expire_zero(self, t_ns: int) -> None:
         """End a request for a zero for which this time is too late, also where no reading comes."""
-        if self._zero is not None and self._zero.is_too_late(t_ns):
-            self._zero.expire(self._not_taken(self._zero, self._timeout_s))
-            structlog.get_logger().warning(self._zero.reason)
+        if (zero := self._zero) is not None:
+            zero.expire_if_late(t_ns, lambda: self._not_taken(zero, self._timeout_s))
 
     def _end_zero(self, zero: ZeroRequest, samples: Sequence[float]) -> None:
         """Make the mean of raw samples the zero, unless they are of a load, or of one that came or went."""

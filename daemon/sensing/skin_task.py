@@ -132,9 +132,8 @@ class SkinTask:
 
     def _expire_zero(self, t_ns: int) -> None:
         """End a request for which a sample that arrives then is too late; the estimator gives up by the same time."""
-        if self._zero is not None and self._zero.is_too_late(t_ns):
-            self._zero.expire(self._not_taken(self._zero_timeout_s))
-            structlog.get_logger().warning(self._zero.reason)
+        if self._zero is not None:
+            self._zero.expire_if_late(t_ns, lambda: self._not_taken(self._zero_timeout_s))
 
     def _follow_estimator(self) -> None:
         """Bring the request for a zero up to the estimator, which has taken the next sample."""

@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Callable
 from enum import Enum
 
+import structlog
+
 from shearloop.timeouts import timeout
 
 # The longest time of a zero, which takes two seconds; a slow sensor gets more.
@@ -47,10 +49,6 @@ class ZeroRequest:
         """Return whether the next measurements belong to it."""
         return self.is_open and now_ns <= self.until_ns
 
-    def is_too_late(self, t_ns: int) -> bool:
-        """Return whether a measurement of this time is too late for it, although it has not ended."""
-        return self.is_open and t_ns > self.until_ns
-
     def collect(self) -> None:
         """Note that a measurement belongs to it."""
         if self.is_open:
@@ -67,6 +65,12 @@ class ZeroRequest:
     def expire(self, reason: str = "") -> None:
         """End it without a zero, after its time or when its step has ended."""
         self._end(ZeroState.EXPIRED, reason)
+
+    def expire_if_late(self, t_ns: int, why: Callable[[], str]) -> None:
+        """End it if a measurement of this time is too late for it; the reason is logged."""
+        if self.is_open and t_ns > self.until_ns:
+            self.expire(why())
+            structlog.get_logger().warning(self.reason)
 
     def replace(self, later: "ZeroRequest") -> None:
         """End it by a later request; a step that waits for this one then waits for that one."""

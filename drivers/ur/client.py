@@ -333,9 +333,10 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         looked_s = time.monotonic()
         while not self._closed.is_set():
             now_s = time.monotonic()
-            # While this process stood still, nobody read what the worker sent.
-            self._received_s = min(now_s, self._received_s + max(0.0, now_s - looked_s - WATCH_S))
-            looked_s = now_s
+            late_s, looked_s = now_s - looked_s - WATCH_S, now_s
+            if late_s > 0.0:
+                # This process stood still, and did not read meanwhile.
+                self._received_s = min(now_s, self._received_s + late_s)
             if now_s - self._received_s > self._timeout_s:
                 self._kill()
                 raise RobotLostError("hung", self._hung_sentence(self._timeout_s))

@@ -361,6 +361,13 @@ def test_only_a_step_that_needs_a_torque_asks_for_a_source_that_can_drive(tmp_pa
         check_experiment(made, BARE, commissioned())
 
 
+@pytest.mark.parametrize("misspelt", ["rihgt", "load_cell"])
+def test_a_source_that_the_rig_does_not_have_is_refused_also_where_no_step_needs_one(tmp_path, misspelt):
+    made = config(tmp_path, {"torque_source": misspelt, "steps": [RELEASE, CLOSE, WAIT]}, **BARE_RIG)
+    with pytest.raises(UserError, match=f"torque_source: `{misspelt}` is not a measured torque"):
+        check_experiment(made, BARE, commissioned("e-series"))
+
+
 def test_a_straight_move_of_a_clamped_tool_asks_for_a_source_that_can_drive(tmp_path):
     made = config(tmp_path, {"steps": [RETREAT]}, fingertips={"right": SERIAL})
     with pytest.raises(UserError, match="torque_source: `right` is a fingertip without"):

@@ -3,6 +3,7 @@
 import asyncio
 
 import pytest
+from structlog.testing import capture_logs
 
 from shearloop.daemon.sensing.zero_request import ZeroRequest, ZeroState
 from tests.running import running
@@ -21,8 +22,15 @@ def test_only_an_open_request_is_under_way_until_its_time_is_over():
         assert zero.state is state
         assert zero.is_open
         assert [zero.is_under_way(t_ns) for t_ns in (5, 20, 21)] == [True, True, False]
-        assert [zero.is_too_late(t_ns) for t_ns in (5, 20, 21)] == [False, False, True]
+        for t_ns in (5, 20):
+            zero.expire_if_late(t_ns, lambda: "too late")
+        assert zero.is_open
         zero.collect()
+    with capture_logs() as logs:
+        for t_ns in (21, 22):
+            zero.expire_if_late(t_ns, lambda: "too late")
+    assert (zero.state, zero.reason) == (ZeroState.EXPIRED, "too late")
+    assert [log["event"] for log in logs] == ["too late"]
 
 
 @pytest.mark.parametrize("state", ENDS)
@@ -30,12 +38,12 @@ def test_a_request_ends_once(state):
     zero = ZeroRequest(10, 20)
     ENDS[state](zero)
     reason = zero.reason
-    for end in (*ENDS.values(), lambda zero: zero.collect()):
+    late = (lambda zero: zero.expire_if_late(21, lambda: "too late"),)
+    for end in (*ENDS.values(), *late, lambda zero: zero.collect()):
         end(zero)
     assert (zero.state, zero.reason) == (state, reason)
     assert not zero.is_open
     assert not zero.is_under_way(15)
-    assert not zero.is_too_late(21)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,6 @@ def test_a_few_times_have_a_word():
     [(0.34, 0.3, "", "0.34"), (0.31, 0.3, "", "0.31"), (6.0, 0.3, "", "6.0"), (-0.3004, 0.3, "+", "-0.3004")],
 )
 def test_a_value_beyond_a_limit_does_not_read_as_the_limit(value, limit, sign, text):
-    """It was "stood still for 0.3 s, and 0.3 s are allowed"."""
     assert beyond(value, limit, 1, sign) == text
 
 
@@ -37,7 +36,6 @@ def test_a_number_is_left_out_of_its_word_alone():
 
 
 def test_reasons_that_count_up_are_one_without_the_count():
-    """27 torques were "taking the idle frame, 10 of 10"."""
     reasons = CountedReasons()
     for number in range(1, 28):
         reasons.add(f"taking the idle frame, {number} of 30")

@@ -114,7 +114,6 @@ def test_mistakes_in_three_files_are_shown_together(arguments, said_of):
 
 
 def test_the_files_of_an_invalid_rig_are_found_as_the_rig_names_them(said_of, tmp_path, monkeypatch):
-    """They were sought under `~` and `$BENCH` beside the rig, and named as missing."""
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("BENCH", str(tmp_path))
     rig = replaced(f"{RIG}loop: {{kp: a}}\nexperiment: $BENCH/e.yaml\n", "robot: ur.yaml", "robot: ~/ur.yaml")

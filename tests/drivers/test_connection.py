@@ -217,7 +217,7 @@ async def test_bytes_at_the_deadline_count():
 
 
 async def test_a_reply_that_comes_after_a_pause_of_this_process_is_awaited():
-    """It gave "no whole answer within 0.5 s", although nobody had waited for it."""
+    """Until the pause ends, this process has not waited for it."""
     reader = asyncio.StreamReader()
     receiving = asyncio.create_task(TcpPort("device", reader, SimpleNamespace()).read(0.05))
     await asyncio.sleep(0)

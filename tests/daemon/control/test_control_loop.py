@@ -116,7 +116,6 @@ MISSING = "There is no serial port /dev/load; no USB serial port is plugged in."
 @pytest.mark.parametrize("drive", ["right", "load_cell"])
 @pytest.mark.parametrize("how", ["unplugged", "silent", "never there"])
 def test_a_sensor_that_is_gone_or_silent_refuses_what_needs_torques_before_anything_moves(how, drive, gone):
-    """The start was accepted, the fingers closed, and the wrist was held at its first turn; a `tare` took 15 s."""
     loop = ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("gripper",))
     rig = Rig(loop)
     if how == "never there":
@@ -170,7 +169,6 @@ def test_a_loop_turns_a_tool_by_the_named_torque_alone():
 @pytest.mark.parametrize("stood_s", [0.12, 0.34, 0.9])
 @pytest.mark.parametrize("decided_since", [False, True])
 def test_states_that_are_old_because_the_daemon_stood_still_are_not_blamed_on_a_cable(stood_s, decided_since):
-    """It was "the robot last reported its state 0.34 s ago … check the cable"."""
     rig = Rig(new_loop())
     rig.run(2)
     rig.tick += round(stood_s / TICK_S)

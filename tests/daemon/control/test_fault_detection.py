@@ -168,7 +168,7 @@ def test_torques_of_other_moments_are_not_compared():
 
 @pytest.mark.parametrize("driving", ["left", "right"])
 def test_a_fingertip_that_falls_silent_in_a_turn_is_not_compared_with_later_torques_of_the_other(driving):
-    """Its last torque was held against the other's newest one, 1.1 s later. Before, the two agreed."""
+    """Its last torque is 1.1 s older than the other's newest one; until then the two agree."""
     left, right = replace(EIT, name="left", min_fresh_s=5.0), replace(EIT, min_fresh_s=5.0)
     sources = (left, right) if driving == "left" else (right, left)
     turned = [torque(left, 0.2 - 0.05 * before, came_s=before * EIT.period_s) for before in range(5, -1, -1)]

@@ -112,7 +112,7 @@ def test_what_began_before_the_viewer_is_not_dated_at_its_start():
 
 
 def test_a_standstill_before_the_decision_says_so():
-    """As after a pause of the daemon. The order seemed wrong: decided after 5.6 s, and standstill after 2.7 s."""
+    """As after a pause of the daemon: decided after 5.6 s, and standstill after 2.7 s."""
     times = {"experiment": "hold", "decided_after_s": 5.625, "sent_after_s": 5.627, "stands_after_s": 2.652}
     ((_, said),) = lines(("loop.stop", times))
     assert said.endswith("decided after 5.625 s, sent after 5.627 s, standstill after 2.652 s, before the decision")

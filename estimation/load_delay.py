@@ -59,11 +59,11 @@ _BUFFERED_S = 3.0
 _LARGE_ERROR_S = 0.1
 # A clock that was set forward leaves a gap that is this much longer than a period, in s; this many gaps are tried.
 _GAP_S, _GAPS = 0.3, 5
-# How much faster than the frames' clock the load cell's may run. A microcontroller's resonator is off by up to 0.5 %.
+# Relative rates of the load cell's clock that are tried. A microcontroller's resonator is off by up to 0.5 %.
 _RATES = np.round(np.concatenate([np.arange(-0.02, 0.0, 0.001), np.arange(0.001, 0.0201, 0.001)]), 3)
-# Without the fault, the delay explains this factor more. With fewer changes of load chance does.
+# Corrected times explain the moves better by this factor. With fewer changes of load that can be chance.
 _FAULT_PROMINENCE, _MIN_CHANGES = 1.15, 4
-# The changes of load that show a delay in a fingertip that the tool moves.
+# This number of load changes shows a delay where the tool moves the fingertip.
 MANY_CHANGES = 10
 # Readings per stretch for the load cell's noise, and the least number of stretches.
 _NOISE_READINGS, _MIN_QUIET = 64, 4
@@ -105,7 +105,7 @@ class LoadTiming:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClockFault:
-    """What one clock did against the other one, the cure, and the times (p,) of the load cell's readings without it."""
+    """A fault of one clock: its description, its cure, and the corrected times (p,) of the load cell's readings."""
 
     text: str
     cure: str
@@ -207,10 +207,10 @@ def count_load_changes(series: FrameSeries) -> int:
 
 
 def find_clock_fault(series: FrameSeries, found: LoadDelay | None) -> ClockFault | None:
-    """Return the jump or the wrong rate of the load cell's clock that hides the delay of raw frames, None without one.
+    """Return the jump or the wrong rate of a clock that hides the delay of raw frames, None without one.
 
-    `found` is the delay without a fault, by `find_load_delay`. Once the fault is taken out of the times, a delay stands
-    out. Frames that no grip can be found in, as of a dead board, show none. It takes up to a second.
+    `found` is the delay by `find_load_delay`, without a fault. A fault counts if its corrected times show a delay
+    clearly. Frames without a grip, as of a dead board, show none. It takes up to a second.
     """
     if found is not None and found.error_s <= _LARGE_ERROR_S and not found.late_s:
         return None
@@ -252,16 +252,16 @@ def _most_explained(series: FrameSeries, moves: Sequence[tuple[FloatArray, Float
 
 
 def _possible_faults(series: FrameSeries) -> Iterator[ClockFault]:
-    """Yield what the clocks may have done: one was set forward at a gap of its times, or they ran at two rates."""
+    """Yield the faults that are tried: one clock was set forward at a gap of its times, or the clocks' rates differ."""
     times_s = series.torque_t_s
     cure = "use the part before or after that (--time-range), or record again with one clock for both"
-    for whose, own_s, sign in (("the load cell's", times_s, -1.0), ("the frames'", series.t_s, 1.0)):
+    for clock, own_s, sign in (("the load cell's", times_s, -1.0), ("the frames'", series.t_s, 1.0)):
         steps_s = np.diff(own_s)
         period_s = float(np.median(steps_s))
         gaps = np.flatnonzero(steps_s > period_s + _GAP_S)
         for gap in gaps[np.argsort(steps_s[gaps])[::-1][:_GAPS]].tolist():
             jump_s, after_s = float(steps_s[gap]) - period_s, float(own_s[gap] - series.t_s[0])
-            text = f"{whose} clock was set forward by {jump_s:.1f} s, {after_s:.0f} s after the first frame"
+            text = f"{clock} clock was set forward by {jump_s:.1f} s, {after_s:.0f} s after the first frame"
             moved_s = np.where(times_s > own_s[gap], times_s + sign * jump_s, times_s)
             yield ClockFault(text, cure, moved_s, is_jump=True)
     for rate in _RATES.tolist():

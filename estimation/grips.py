@@ -5,7 +5,6 @@ they stay idle for a while, without torque.
 """
 
 import itertools
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +13,7 @@ from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.estimation.fingertip_validator import STEP_FRAMES
 from shearloop.estimation.series import FrameSeries
-from shearloop.estimation.twists import LOADED_FRACTION
+from shearloop.estimation.twists import LOADED_FRACTION, runs
 from shearloop.estimation.validator_fit import channel_noise, frame_steps
 
 # A large step exceeds the steps of twisting under load by this factor.
@@ -149,15 +148,9 @@ def _find_openings(channels: FloatArray, is_loaded: BoolArray) -> list[int]:
             return False
         return bool(min(moved[start], moved[stop]) > sudden)
 
-    openings = [(start, stop) for start, stop in _runs(is_idle) if is_opening(start, stop)]
+    openings = [(start, stop) for start, stop in runs(is_idle) if is_opening(start, stop)]
     # The next grip is compared with its own idle frames, so it gets enough of them.
     return [max(start, min((start + stop) // 2, stop - _MIN_RELEASED)) for start, stop in openings]
-
-
-def _runs(chosen: BoolArray) -> Iterator[tuple[int, int]]:
-    """Yield the begin and the end of each row of chosen frames."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
-    return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
 
 
 def _idle_end_without_step(frames: FloatArray, loaded: slice) -> int:

@@ -1,6 +1,7 @@
 """Twists in recorded torques, and the gain that fits them."""
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -10,11 +11,16 @@ from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 LOADED_FRACTION = 0.1
 
 
+def runs(chosen: BoolArray) -> Iterator[tuple[int, int]]:
+    """Yield the first row and the end of each unbroken stretch of chosen rows (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]]).astype(np.int8)))
+    return zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+
+
 def find_twists(torque_nm: FloatArray, largest_nm: float | None = None) -> list[IntArray]:
     """Return the rows of each stretch of loaded frames in (n,) torques; the largest torque is given or found."""
     largest_nm = float(np.abs(torque_nm).max(initial=0.0)) if largest_nm is None else largest_nm
-    rows = np.flatnonzero(np.abs(torque_nm) > LOADED_FRACTION * largest_nm)
-    return [twist for twist in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(twist)]
+    return [np.arange(first, end) for first, end in runs(np.abs(torque_nm) > LOADED_FRACTION * largest_nm)]
 
 
 def first_twists(torque_nm: FloatArray, grips: IntArray) -> BoolArray:

@@ -16,7 +16,7 @@ from shearloop.daemon.recorder import schema
 from shearloop.drivers.serial_sensor import InputKind
 from shearloop.estimation import Measured
 from shearloop.tools.recordings.before_frame import before_frame
-from shearloop.tools.recordings.load_values import STRAY, stray_values
+from shearloop.tools.recordings.load_validity import STRAY, stray_values
 from shearloop.tools.recordings.reader import open_recording, reading, unusable
 from shearloop.words import counted
 

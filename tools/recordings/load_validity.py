@@ -1,6 +1,5 @@
-"""Which of a load cell's recorded values can be its readings: not those of a damaged line, a hung one, another unit."""
+"""Validity of recorded load values: those of a damaged line, of a line that hung, or of another unit are invalid."""
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +10,11 @@ from shearloop.drivers.defaults import LOAD_CELL_RATE_HZ
 from shearloop.drivers.load_cell import CAPACITY_NM, SLEW_NM_PER_S, STUCK_AFTER
 from shearloop.drivers.serial_sensor import SETTLE_VALUES, StepFilter
 from shearloop.errors import UserError
+from shearloop.estimation.twists import runs
 from shearloop.words import counted
 
 # A cable damages fewer values than this fraction: the two recorded cases are one load value in a hundred.
-_MAX_DAMAGED = 0.1
+MAX_DAMAGED = 0.1
 # Damaged values occur singly. This number in a row is a twist, in another unit.
 _MAX_IN_A_ROW = 4
 # The rig may be knocked. It does not jump more often than this to another torque.
@@ -29,8 +29,7 @@ _SAME_NM = 1e-9
 # A line that hung goes on at another torque, further away than the load changes elsewhere between two values.
 _HUNG_JUMP = 2.0
 # A stray value differs from the values around it by more than this number of standard deviations of the noise, of
-# steps of the values around it, and of steps of rounding, and by more than the last number in N·m. No real value of
-# 11 229 comes closer than a third of all of these.
+# steps of the values around it, and of steps of rounding, and by more than the last number in N·m.
 _STRAY_NOISE, _STRAY_STEPS, _STRAY_ROUNDING, _STRAY_NM = 40.0, 4.0, 2.5, 5e-4
 STRAY = "leave the values around them and come back at once: spikes of a damaged line"
 # Steps on either side that show how fast the load moves.
@@ -42,17 +41,17 @@ _LONGEST_STRAY_S = 0.5
 
 
 def valid_load(path: Path, unix_s: FloatArray, torque_nm: FloatArray) -> tuple[IntArray, list[str]]:
-    """Return the rows of valid values by rising time, and how many others were left out and why, in clauses.
+    """Return the rows of valid values by rising time, and clauses that count the others by cause.
 
     Raises UserError for values of another unit.
     """
     n = counted(len(torque_nm), "load value")
     left_out: list[str] = []
 
-    def leave_out(rows: IntArray, what: BoolArray, why: str) -> IntArray:
-        if what.any():
-            left_out.append(f"{np.count_nonzero(what)} of {n} {why}")
-        return rows[~what]
+    def leave_out(rows: IntArray, invalid: BoolArray, why: str) -> IntArray:
+        if invalid.any():
+            left_out.append(f"{np.count_nonzero(invalid)} of {n} {why}")
+        return rows[~invalid]
 
     _check_unit(path, torque_nm)
     rows = np.arange(len(torque_nm))
@@ -75,7 +74,7 @@ def valid_load(path: Path, unix_s: FloatArray, torque_nm: FloatArray) -> tuple[I
 
 
 def rounding_step_nm(torque_nm: FloatArray) -> float:
-    """Return the step in N·m to which (n,) values are rounded, 0 where none is seen or it is below the cell's noise."""
+    """Return the step in N·m to which (n,) values are rounded, 0 without one above the cell's noise."""
     apart_nm = np.diff(np.unique(torque_nm))
     apart_nm = apart_nm[apart_nm > _SAME_NM]
     # The smallest differences may be of damaged values.
@@ -132,11 +131,11 @@ def stray_values(t_s: FloatArray, torque_nm: FloatArray) -> BoolArray:
 
 
 def _check_unit(path: Path, torque_nm: FloatArray) -> None:
-    """Raise UserError where more torques (n,) are too large for the cell than a cable damages: another unit."""
+    """Raise UserError where (n,) torques have another unit: more are too large for the cell than a cable damages."""
     is_beyond = np.abs(torque_nm) > CAPACITY_NM
     beyond = int(np.count_nonzero(is_beyond))
-    in_a_row = max((len(list(run)) for large, run in itertools.groupby(is_beyond) if large), default=0)
-    if beyond > max(2, _MAX_DAMAGED * len(torque_nm)) or in_a_row > _MAX_IN_A_ROW:
+    in_a_row = max((end - first for first, end in runs(is_beyond)), default=0)
+    if beyond > max(2, MAX_DAMAGED * len(torque_nm)) or in_a_row > _MAX_IN_A_ROW:
         raise UserError(
             f"{path}: {beyond} of {counted(len(torque_nm), 'load value')} are beyond {CAPACITY_NM:g} N·m, the capacity "
             "of the rig's load cell, so they have another unit; write them in N·m"
@@ -147,7 +146,7 @@ def _check_spikes(path: Path, torque_nm: FloatArray, spikes: BoolArray) -> None:
     """Raise UserError where (n,) torques by rising time jump too often to be spikes of a damaged line."""
     steps = _kept_steps(torque_nm, spikes)
     found = int(np.count_nonzero(spikes))
-    if steps <= _MAX_STEPS and found <= max(2, _MAX_DAMAGED * len(torque_nm)):
+    if steps <= _MAX_STEPS and found <= max(2, MAX_DAMAGED * len(torque_nm)):
         return
     raise UserError(
         f"{path}: {found} of {counted(len(torque_nm), 'load value')} jump by more than {SLEW_NM_PER_S:g} N·m/s, which "
@@ -157,12 +156,13 @@ def _check_spikes(path: Path, torque_nm: FloatArray, spikes: BoolArray) -> None:
 
 
 def _kept_steps(torque_nm: FloatArray, spikes: BoolArray) -> int:
-    """Return after how many rows of spikes (n,) the torque stayed nearer to them than to the torque before them."""
-    edges = np.diff(np.concatenate([[False], spikes, [False]]).astype(np.int8))
-    begins, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    inside = (begins > 0) & (ends < len(spikes)) & (ends - begins >= SETTLE_VALUES - 1)
-    before, last, after = torque_nm[begins[inside] - 1], torque_nm[ends[inside] - 1], torque_nm[ends[inside]]
-    return int(np.count_nonzero(np.abs(after - last) < np.abs(after - before)))
+    """Return how many runs of spikes (n,) are steps: the torque after them is nearer to them than to that before."""
+    steps = 0
+    for first, end in runs(spikes):
+        if first > 0 and end < len(spikes) and end - first >= SETTLE_VALUES - 1:
+            before_nm, last_nm, after_nm = torque_nm[first - 1], torque_nm[end - 1], torque_nm[end]
+            steps += bool(abs(after_nm - last_nm) < abs(after_nm - before_nm))
+    return steps
 
 
 def _spikes(unix_s: FloatArray, torque_nm: FloatArray, period_s: float) -> list[bool]:

@@ -30,7 +30,7 @@ from shearloop.estimation import FrameSeries
 from shearloop.estimation.load_delay import find_clock_fault, measured_delay
 from shearloop.estimation.values import longest_load_gap_s
 from shearloop.files import open_file
-from shearloop.tools.recordings.load_values import rounding_step_nm, valid_load
+from shearloop.tools.recordings.load_validity import MAX_DAMAGED, rounding_step_nm, valid_load
 from shearloop.tools.recordings.time_formats import DATENUM, STREAM_VARIABLES, TIME_FORMATS
 from shearloop.words import counted
 
@@ -53,8 +53,6 @@ _SHORTEST_STEP_S, _LONGEST_STEP_S = 0.005, 10.0
 _SHORTEST_FRAME_S = 0.05
 # Lines that were stamped late are fewer than this fraction.
 _MAX_LATE = 0.1
-# A cable damages fewer values than this fraction.
-_MAX_DAMAGED = 0.1
 _TORQUE_SLICE = re.compile(r"Data_Slice_(\d+)\.mat")
 _DIAMETER_SLICE = re.compile(r"(\d+(?:\.\d+)?)mm_Data_(\d+)\.mat")
 # Among this many frames on either side, at least one should have been read without delay.
@@ -431,7 +429,7 @@ def _hours(seconds: float) -> str:
 def _check_volts(path: Path, lines: FloatArray) -> None:
     """Raise UserError where more values of lines (n, 1024) in volts are impossible than a cable damages."""
     beyond = np.count_nonzero((lines < 0) | (lines > ADC_REFERENCE_V))
-    if beyond > _MAX_DAMAGED * lines.size:
+    if beyond > MAX_DAMAGED * lines.size:
         raise UserError(
             f"{path}: {beyond / lines.size:.0%} of the values are not within 0 to {ADC_REFERENCE_V:g} V, the range of "
             "the board's converter; write them in volts"

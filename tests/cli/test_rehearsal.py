@@ -24,7 +24,7 @@ from shearloop.drivers.load_cell import LoadCalibration
 from shearloop.drivers.ur.settings import GENERATIONS, read_settings
 from shearloop.emulators.ur_arm import HOME_RAD, frame_of_pose, joints_within, tool_frames
 from shearloop.errors import UserError
-from shearloop.tools.commission.report import save_report
+from shearloop.tools.commission.report import write_report
 from tests.fixtures.daemons import shearloop
 
 REAL = {
@@ -260,7 +260,7 @@ def report_of_emulated(path: Path) -> Report:
 @pytest.mark.usefixtures("ur_rtde")
 async def test_the_experiment_of_a_real_configuration_runs_to_its_end_with_the_limits_that_a_report_raises(real_rig):
     path = real_rig("robot", "gripper", "load_cell", experiment="short.yaml", commissioned="emulated.yaml")
-    save_report(path.with_name("emulated.yaml"), report_of_emulated(path))
+    write_report(path.with_name("emulated.yaml"), report_of_emulated(path))
     async with shearloop("run", str(path), "--emulate") as daemon:
         out, log = await asyncio.wait_for(daemon.communicate(), 90)
     assert daemon.returncode == 0, log.decode()

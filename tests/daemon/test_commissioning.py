@@ -25,7 +25,7 @@ from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import RobotLostError, WorkerPhase
 from shearloop.drivers.ur.settings import read_settings
 from shearloop.errors import UserError
-from shearloop.tools.commission.report import earlier_report, save_report
+from shearloop.tools.commission.report import earlier_report, write_report
 from shearloop.tools.doctor import check_cap
 from shearloop.tools.doctor.devices import check_identity
 from tests.fixtures.daemons import ask, collector, robot_at, running_daemon
@@ -79,7 +79,7 @@ def report_of(
 
 def commissioned(folder: Path, report: Report, now: datetime = NOW, **content: object):
     """Return what a rig's report allows."""
-    save_report(folder / "report.yaml", report)
+    write_report(folder / "report.yaml", report)
     path = write_rig(folder, commissioned="report.yaml", **content)
     config = load_daemon_config(path)
     return commissioning_of(config, read_settings(config.robot), now)
@@ -166,7 +166,7 @@ def test_a_report_that_does_not_count_raises_and_supplies_nothing(tmp_path, chan
 )
 def test_a_report_with_a_value_that_no_stage_measures_is_refused(tmp_path, key, value):
     path = tmp_path / "report.yaml"
-    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    write_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
     written = yaml.safe_load(path.read_text())
     written["stages"][0]["supplies"][key] = value
     path.write_text(yaml.safe_dump(written))
@@ -177,7 +177,7 @@ def test_a_report_with_a_value_that_no_stage_measures_is_refused(tmp_path, key, 
 def test_a_value_beyond_its_range_names_the_way_to_a_report_without_it(tmp_path):
     """It invites nobody to edit a measurement."""
     path = tmp_path / "report.yaml"
-    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    write_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
     written = yaml.safe_load(path.read_text())
     written["stages"][0]["supplies"]["rest_rad_per_s"] = 0.08
     path.write_text(yaml.safe_dump(written))
@@ -188,7 +188,7 @@ def test_a_value_beyond_its_range_names_the_way_to_a_report_without_it(tmp_path)
 
 def test_the_values_of_a_failed_stage_are_left_out_whatever_they_are(tmp_path, capsys):
     """An earlier version wrote the noise that failed the stage, and the range of rest ends before it."""
-    save_report(tmp_path / "report.yaml", report_of(write_rig(tmp_path), "0134", SUPPLIED))
+    write_report(tmp_path / "report.yaml", report_of(write_rig(tmp_path), "0134", SUPPLIED))
     written = yaml.safe_load((tmp_path / "report.yaml").read_text())
     failed = written["stages"][2]
     failed["lines"][0]["verdict"], failed["supplies"] = "failed", {"rest_rad_per_s": 0.08}
@@ -203,7 +203,7 @@ def test_the_values_of_a_failed_stage_are_left_out_whatever_they_are(tmp_path, c
 @pytest.mark.parametrize("name", ["", "tool and spring"])
 def test_a_stage_without_a_number_is_refused(tmp_path, name):
     path = tmp_path / "report.yaml"
-    save_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
+    write_report(path, report_of(write_rig(tmp_path), "7", SUPPLIED))
     written = yaml.safe_load(path.read_text())
     written["stages"][0]["stage"] = name
     path.write_text(yaml.safe_dump(written))
@@ -236,7 +236,7 @@ AGAIN = "run `shearloop commission CONFIG --out FILE"
 def test_each_reason_against_a_report_has_the_cure_that_removes_it(tmp_path, change, now, cure):
     """Values that two stages judge have changed too, and measuring these again would not be enough."""
     report = report_of(write_rig(tmp_path), "013457", SUPPLIED)
-    save_report(tmp_path / "report.yaml", change(report))
+    write_report(tmp_path / "report.yaml", change(report))
     path = write_rig(tmp_path, commissioned="report.yaml")
     if cure == NEW:
         rewrite(tmp_path / "ur.yaml", reaction_s=0.05)
@@ -261,7 +261,7 @@ def rehearsing(folder: Path, report: Report | None, **content: object):
     """Return what a report allows in a rehearsal of a rig, which has other addresses."""
     real = load_daemon_config(write_rig(folder, **content))
     if report is not None:
-        save_report(folder / "report.yaml", report)
+        write_report(folder / "report.yaml", report)
         real = load_daemon_config(write_rig(folder, commissioned="report.yaml", **content))
     played = {"load_cell": {"device": {"path": "cell"}}, "emulated": True, "commissioned": real.commissioned}
     config = RehearsedConfig(real, {**played, "robot": real.robot})
@@ -401,7 +401,7 @@ def raised_by(folder: Path, **content: object):
     path = write_rig(folder, fingertips=CALIBRATED)
     own = source_sha256(load_daemon_config(path), "right")
     report = report_of(path, "013457", SUPPLIED.model_copy(update={"torque_sources": {"right": own, "wrench": ""}}))
-    save_report(folder / "report.yaml", report)
+    write_report(folder / "report.yaml", report)
     config = load_daemon_config(
         write_rig(folder, **{"commissioned": "report.yaml", "fingertips": CALIBRATED, **content})
     )
@@ -442,7 +442,7 @@ def test_a_report_of_before_raises_the_torque_of_the_load_cell_alone(tmp_path):
 def test_an_experiment_of_another_source_is_refused_beyond_its_cap(tmp_path, capsys):
     report = report_of(write_rig(tmp_path), "01357", SUPPLIED)
     dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
-    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    write_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
     rig = write_rig(tmp_path, commissioned="report.yaml")
     step, limits = {"do": "twist", "angles_rad": [0.1]}, {"torque_nm": 0.35}
     path = tmp_path / "one.yaml"
@@ -505,7 +505,7 @@ def test_a_one_way_lever_raises_the_torque_of_its_direction_alone(tmp_path, caps
     supplies = SUPPLIED.model_copy(update={"torque_sources": {"wrench": ""}})
     report = report_of(write_rig(tmp_path, **one_way, **gripper), "013457", supplies)
     dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
-    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    write_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
     rig = write_rig(tmp_path, commissioned="report.yaml", **one_way, **gripper)
     path = tmp_path / "one.yaml"
     content = {"name": "one", "torque_source": "wrench", "limits": {"torque_nm": 0.35}, "steps": steps}
@@ -638,7 +638,7 @@ def test_check_and_doctor_say_that_the_cap_holds(tmp_path, capsys):
 def test_doctor_compares_the_controller_with_settings_and_report(tmp_path):
     report = report_of(write_rig(tmp_path), "013457", SUPPLIED)
     dated = [stage.model_copy(update={"date": datetime.now(UTC)}) for stage in report.stages]
-    save_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
+    write_report(tmp_path / "report.yaml", report.model_copy(update={"stages": tuple(dated)}))
     config = load_daemon_config(write_rig(tmp_path, commissioned="report.yaml"))
     settings = read_settings(config.robot)
     assert list(check_identity(config, settings, VERSION, SERIAL)) == []
@@ -658,7 +658,7 @@ def test_a_missing_report_is_a_mistake_of_the_configuration(tmp_path):
 
 def test_a_report_that_is_named_from_the_shells_folder_is_found_beside_the_configuration(tmp_path):
     report = report_of(write_rig(tmp_path), "0")
-    save_report(tmp_path / "report.yaml", report)
+    write_report(tmp_path / "report.yaml", report)
     config = load_daemon_config(write_rig(tmp_path, commissioned="my-rig/report.yaml"))
     with pytest.raises(UserError, match=f"did you mean {tmp_path / 'report.yaml'}[?]"):
         commissioning_of(config, read_settings(config.robot), NOW)
@@ -702,7 +702,7 @@ def test_what_some_stages_judged_makes_them_old_and_no_other(tmp_path, change, s
     (tmp_path / "cell.yaml").write_text(yaml.safe_dump(CELL))
     cell = {"device": {"serial_number": "7583"}, "calibration": "cell.yaml"}
     path = write_rig(tmp_path, load_cell=cell, commissioned="report.yaml")
-    save_report(tmp_path / "report.yaml", report_of(path, "0134567", SUPPLIED))
+    write_report(tmp_path / "report.yaml", report_of(path, "0134567", SUPPLIED))
     config = load_daemon_config(path)
     assert commissioning_of(config, read_settings(config.robot), NOW).counts
     before = identity_of(config, VERSION, SERIAL)
@@ -732,7 +732,7 @@ def test_a_short_delay_that_was_measured_does_not_shorten_the_way_to_brake(tmp_p
     config = load_daemon_config(path)
     assert SUPPLIED.reaction_s < 0.05
     report = report_of(path, "01357", SUPPLIED)
-    save_report(tmp_path / "report.yaml", report)
+    write_report(tmp_path / "report.yaml", report)
     found = commissioning_of(
         config.model_copy(update={"commissioned": tmp_path / "report.yaml"}), read_settings(config.robot), NOW
     )

@@ -128,12 +128,6 @@ def page_path(report: Path) -> Path:
     return report.with_suffix(".html")
 
 
-def save_report(path: Path, report: Report, unmeasured: Sequence[str] = ()) -> Path:
-    """Write the report, and its page into the same folder; return the page's path."""
-    write_report(path, report)
-    return write_page(path, report, unmeasured)
-
-
 def write_report(path: Path, report: Report) -> None:
     """Write the report; raises UserError where that fails, and an earlier report is then unchanged."""
     content = report.model_dump(mode="json", exclude_none=True)

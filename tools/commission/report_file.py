@@ -1,4 +1,4 @@
-"""The file of a report while a commissioning runs: one commissioning writes it, and says what is in it at its end."""
+"""The file of a report during a commissioning: no other one writes it, and each error says which stages it has."""
 
 import errno
 from collections.abc import Iterator, Sequence
@@ -16,18 +16,18 @@ from shearloop.tools.outputs import check_overwrite, check_place
 
 @dataclass(slots=True)
 class ReportFile:
-    """The report's path, the report on the disk, and the stage whose result is not in it yet."""
+    """The report's path, the report on the disk, and the stage that is being measured."""
 
     path: Path
     written: Report | None
     _measuring: str = ""
-    # What `commission` needs to continue here, beside the words that it was given.
+    # The end of the cure: the option with which `commission` continues here.
     _continues: str = ""
 
     @classmethod
     @contextmanager
     def opened(cls, path: Path) -> Iterator[Self]:
-        """Yield the file, which no other commissioning writes meanwhile.
+        """Yield the file, and keep other commissionings from writing it.
 
         Raises UserError where report or page cannot be written, or would replace a file of another kind.
         """
@@ -38,12 +38,12 @@ class ReportFile:
             yield cls(path, written)
 
     def begin(self, stage: str, remaining: Sequence[str] = ()) -> None:
-        """Take that a stage begins; `remaining` are the figures of the named stages from here on, if any is named."""
+        """Remember which stage is measured; `remaining` are the figures of the named stages from here on, if any."""
         self._measuring = stage
         self._continues = f" with `--stages {''.join(remaining)}`" if remaining else ""
 
     def save(self, report: Report, unmeasured: Sequence[str] = ()) -> Path:
-        """Write the report and its page; return the page's path. Raises UserError, which names the file that failed."""
+        """Write the report and its page, and return the page's path; raises UserError with the file that failed."""
         write_report(self.path, report)
         self.written, self._measuring = report, ""
         return write_page(self.path, report, unmeasured)
@@ -77,7 +77,7 @@ class ReportFile:
 
 @contextmanager
 def _sole(path: Path) -> Iterator[None]:
-    """Keep other commissionings from writing a report, by a locked file beside it that is removed at the end."""
+    """Keep other commissionings from writing a report, by a locked file in its folder that is removed at the end."""
     report = path.resolve()
     locked = report.with_name(f"{report.name}.lock")
     with ExitStack() as opened:
@@ -93,6 +93,6 @@ def _sole(path: Path) -> Iterator[None]:
         try:
             yield
         finally:
-            # While it is locked: the next commissioning makes its own.
+            # It is still locked: the next commissioning makes its own.
             with suppress(OSError):
                 locked.unlink()

@@ -33,7 +33,7 @@ from shearloop.tools.commission import identity
 from shearloop.tools.commission.context import Context, Counts
 from shearloop.tools.commission.identity import EMULATED_CHECKSUM, Identity, judge_identity
 from shearloop.tools.commission.operator import DeclinedError, Operator
-from shearloop.tools.commission.report import earlier_report, report_for, save_report, with_stage
+from shearloop.tools.commission.report import earlier_report, report_for, with_stage, write_page, write_report
 from tests.emulator_process import EmulatorProcess
 from tests.fixtures.robots import TOOL, write_filled_in
 
@@ -183,10 +183,12 @@ def test_a_report_is_continued_and_a_repeated_stage_replaced(tmp_path):
         for date, verdict in (("2026-01-01T00:00:00Z", "failed"), ("2026-01-02T00:00:00Z", "passed"))
     )
     path = tmp_path / "report.yaml"
-    save_report(path, with_stage(begun, bad))
+    write_report(path, with_stage(begun, bad))
     found = report_for(RIG, earlier_report(path), path)
     assert (found.stages, found.passed) == ((bad,), False)
-    page = save_report(path, with_stage(found, good), ["4 stops"])
+    repeated = with_stage(found, good)
+    write_report(path, repeated)
+    page = write_page(path, repeated, ["4 stops"])
     assert report_for(RIG, earlier_report(path), path).stages == (good,)
     text = page.read_text()
     HTMLParser().feed(text)
@@ -245,7 +247,8 @@ def test_file_and_page_have_each_value_of_a_stage_under_its_name(tmp_path):
     report = with_stage(Report(rig=RIG), result)
     path = tmp_path / "report.yaml"
     page = Cells()
-    page.feed(save_report(path, report).read_text())
+    write_report(path, report)
+    page.feed(write_page(path, report).read_text())
     assert yaml.safe_load(path.read_text()) == {"version": 3, "rig": RIG.model_dump(), "stages": [content]}
     assert earlier_report(path) == report
     headings, values = page.rows
@@ -261,14 +264,14 @@ def stage(verdict: str) -> StageResult:
 def test_a_report_in_which_nothing_passed_is_begun_anew_with_settings_that_were_mended(tmp_path):
     path = tmp_path / "report.yaml"
     mended = RIG.model_copy(update={"robot_settings_sha256": "other"})
-    save_report(path, Report(rig=RIG, stages=(stage("failed"),)))
+    write_report(path, Report(rig=RIG, stages=(stage("failed"),)))
     assert report_for(mended, earlier_report(path), path) == Report(rig=mended)
 
 
 @pytest.mark.parametrize("changed", list(RigIdentity.model_fields))
 def test_a_report_of_another_rig_is_not_continued(tmp_path, changed):
     path = tmp_path / "report.yaml"
-    save_report(path, Report(rig=RIG, stages=(stage("passed"),)))
+    write_report(path, Report(rig=RIG, stages=(stage("passed"),)))
     other = RIG.model_copy(update={changed: True if changed == "emulated" else "other"})
     why = (
         "is of real devices, and these are emulated" if changed == "emulated" else "changed since this report was begun"

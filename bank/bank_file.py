@@ -109,7 +109,7 @@ class Bank(BankDefinition):
 
     @classmethod
     def open(cls, path: str | Path) -> "Bank":
-        """Map a bank file read-only, and compare its checksums (0.03 s for 36 MB).
+        """Map a bank file read-only, and compare its checksums.
 
         Raises BankFileError for a file that is missing, not a bank, truncated, damaged, or made under another format
         or channel table.

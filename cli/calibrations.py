@@ -67,7 +67,7 @@ def check_recipe(args: argparse.Namespace, recordings: Sequence[Path]) -> None:
 
 
 def save_measured(out: Path, calibration: "CalibrationModel") -> None:
-    """Write a calibration that a person has measured; a DeviceCalibrationError shows what was not written."""
+    """Write a calibration that a person has measured; a note of a DeviceCalibrationError has its content."""
     import yaml
 
     from shearloop.drivers.calibration_files import save_calibration
@@ -77,7 +77,7 @@ def save_measured(out: Path, calibration: "CalibrationModel") -> None:
         save_calibration(out, calibration)
     except DeviceCalibrationError as error:
         content = yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-        error.add_note(f"Write what was measured into a file yourself:\n{content.strip()}")
+        error.add_note(f"Write these measured values into a file yourself:\n{content.strip()}")
         raise
 
 

@@ -79,7 +79,7 @@ def _note_rehearsal(config: "DaemonConfig", path: Path, parts: "Parts") -> None:
 
 
 def _refuse_no_section(content: object, path: Path) -> None:
-    """Raise UserError for a file that is neither an experiment nor a configuration, with what it is."""
+    """Raise UserError for a file without keys, which is no experiment and no configuration."""
     if isinstance(content, dict):
         return
     if not isinstance(content, list):
@@ -149,8 +149,8 @@ def _check_named_files(path: Path, parts: "Parts", experiment: Path | None = Non
     from shearloop.yaml_files import read_yaml
 
     content: object = None
+    # The mistakes of the configuration are named already.
     with suppress(UserError):
-        # This mistake is named already.
         content = read_yaml(path, UserError)
     given = content if isinstance(content, dict) else {}
     folder = path.resolve().parent

@@ -16,9 +16,9 @@ from shearloop.errors import UserError
 UNIT = "shearloop.service"
 EXAMPLE = "etc/shearloop/shearloop.yaml"
 _DROP_INS = f"etc/systemd/system/{UNIT}.d"
-# systemd reads these by name, so that the override.conf of `systemctl edit` counts more.
+# systemd reads these in the order of their names, so that the override.conf of `systemctl edit` overrides it.
 REAL_TIME = f"{_DROP_INS}/10-realtime.conf"
-# Installed by 0.3.0, and read after override.conf.
+# Its name in 0.3.0, which systemd reads after override.conf.
 _EARLIER_REAL_TIME = f"{_DROP_INS}/realtime.conf"
 # Target of each file of `systemd/`, relative to the system's root.
 PLACES = {
@@ -193,7 +193,7 @@ def _own_drop_ins(root: Path) -> bool:
 
 
 def _besides(target: Path, content: bytes) -> str:
-    """Return which lines a file has and its new content has not, and where a person keeps such lines; empty without."""
+    """Return a clause on the lines of a file that its new content lacks, with the place for them; empty without any."""
     known = content.decode().splitlines()
     lines = [line.strip() for line in target.read_text(encoding="utf-8", errors="replace").splitlines()]
     own = [f"`{line}`" for line in lines if line and not line.startswith("#") and line not in known]

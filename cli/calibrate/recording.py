@@ -258,7 +258,7 @@ def sentences_of(result: "CalibrationResult") -> list[str]:
 
 
 def _unverified(result: "CalibrationResult", widening: float) -> str:
-    """Return that the load cell's times are not verified, why, what that costs, and the cure."""
+    """Return the sentences on a load cell's times that are not verified: cause, effect and cure."""
     effect = "and the intervals of loaded frames do not allow for it"
     if widening > 1.0:
         effect = f"so the intervals of loaded frames are {widening:.2g} times wider"

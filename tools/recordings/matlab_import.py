@@ -414,7 +414,7 @@ def _read_streams(files: Sequence[Path], time_format: str) -> tuple[Stream | Non
 
 
 def _zones_apart_s(earlier_s: FloatArray, later_s: FloatArray) -> float | None:
-    """Return how far two time zones are apart in which one recording has the times (n,) and (m,), None if none are."""
+    """Return the offset in s of two time zones if (n,) and (m,) are times of one recording in both, else None."""
     apart_s = float(later_s.min() - earlier_s.min())
     zones_s = round(apart_s / _ZONE_S) * _ZONE_S
     lasts_s = [float(np.ptp(times_s)) for times_s in (earlier_s, later_s)]

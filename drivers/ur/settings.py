@@ -93,7 +93,7 @@ class GenerationFacts:
 
     @property
     def estimated_nm(self) -> float:
-        """The uncertainty of an estimated torque, N·m; 0 for a measured one, whose noise the commissioning judges."""
+        """The uncertainty of an estimated torque, N·m; 0 for a measured one: the commissioning judges its noise."""
         return 0.0 if self.zeroes_wrench else self.noise_nm
 
 
@@ -108,14 +108,14 @@ GENERATIONS: Final[dict[Generation, GenerationFacts]] = {
 
 
 class _Checked:
-    """Makes pydantic refuse unknown keys and what is no finite number, and describe keys by their docstrings."""
+    """Makes pydantic refuse unknown keys, booleans and infinities as numbers, and describe keys by their docstrings."""
 
     __slots__ = ()
     __pydantic_config__: ClassVar = {"extra": "forbid", "allow_inf_nan": False, "use_attribute_docstrings": True}
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: type, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return the schema of a section, whose booleans are no numbers; they are none for a strict one anyway."""
+        """Return a section's schema that refuses a boolean as a number; pydantic's strict schema does so by itself."""
         types, strict = get_type_hints(source), handler(source)
         lax = no_info_before_validator_function(lambda content: booleans_as_text(content, types), strict)
         return lax_or_strict_schema(lax, strict)

@@ -40,6 +40,9 @@ system-packages:
 	missing=; \
 	command -v systemd-analyze >/dev/null || missing="$$missing systemd"; \
 	command -v chromium >/dev/null || missing="$$missing chromium fonts-dejavu-core"; \
+	command -v g++ >/dev/null || missing="$$missing g++"; \
+	[ -e /usr/include/zmq.h ] || missing="$$missing libzmq3-dev"; \
+	[ -e /usr/include/nlohmann/json.hpp ] || missing="$$missing nlohmann-json3-dev"; \
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
 # A person's stop (4), Ctrl-C (130) and an end on request (143) are no errors of make; a fault's stop is: the demo has said what happened.

@@ -112,7 +112,7 @@ def program_of(ending: str, folder: Path) -> list[object]:
         return [sys.executable, script]
     compiler = shutil.which("g++")
     if compiler is None or not all(Path("/usr/include", name).exists() for name in ("zmq.h", "nlohmann/json.hpp")):
-        pytest.skip("needs g++, libzmq3-dev and nlohmann-json3-dev to compile the C++ subscriber")
+        pytest.skip("needs g++, libzmq and nlohmann-json: `make system-packages` installs them")
     compiled = folder / "subscriber"
     subprocess.run([compiler, script, "-lzmq", "-o", compiled], check=True)
     return [compiled]

@@ -26,7 +26,7 @@ def test_a_value_beyond_a_limit_does_not_read_as_the_limit(value, limit, sign, t
 
 
 def test_a_number_is_left_out_of_its_word_alone():
-    """A bracket went with its number, and a gap that a number leaves made no count at all."""
+    """A bracket stays without its number, and a gap without one is the same reason."""
     reasons = CountedReasons()
     for number in ("0.3", "12.5", "7.0"):
         reasons.add(f"it rose by +{number} N·m (limit {number}), in 2 steps")

@@ -185,7 +185,7 @@ NO_WIDTH, BYTE_ORDER = "\N{ZERO WIDTH SPACE}", "\N{ZERO WIDTH NO-BREAK SPACE}"
     ],
 )
 def test_a_slip_of_the_pen_is_named_where_it_stands(right, wrong, said, said_of):
-    assert f"{said}" in said_of("e.yaml", experiment=replaced(EXPERIMENT, right, wrong))
+    assert said in said_of("e.yaml", experiment=replaced(EXPERIMENT, right, wrong))
 
 
 @pytest.mark.parametrize("name", ["0.1\N{NO-BREAK SPACE}N·m", "a “slow” sweep", "one – two", "Prüfung 3 µm", "日本"])

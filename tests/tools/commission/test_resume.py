@@ -327,7 +327,7 @@ def test_a_report_that_cannot_be_written_is_refused_before_the_first_question(tm
 
 @pytest.mark.usefixtures("ur_rtde")
 def test_a_second_commissioning_into_the_same_report_is_refused(tmp_path, monkeypatch):
-    """The one that ended last wrote its report over the other's stage."""
+    """Otherwise the one that ends last replaces the other's stages."""
     first, second, out = tmp_path / "first", tmp_path / "second", tmp_path / "report.yaml"
     link = tmp_path / "link.yaml"
     link.symlink_to(out)

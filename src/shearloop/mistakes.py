@@ -17,7 +17,7 @@ from pydantic_core import ErrorDetails
 
 from shearloop.lookalikes import note_on
 from shearloop.units import unit_hint, unit_of
-from shearloop.words import LONGEST_VALUE, counted, shown
+from shearloop.words import counted, shortened, shown
 
 # A decimal with a comma, as German and French have it, and the cure.
 _DECIMAL_COMMA = re.compile(r"[-+]?[0-9]+,[0-9]+")
@@ -137,8 +137,7 @@ def _shown_at(details: ErrorDetails, content: object, root: yaml.Node | None) ->
     """Return the value of a mistake for its sentence: a list or a section as it stands in the file."""
     node = _node_at(details["loc"], content, root, key=False)
     if isinstance(node, yaml.CollectionNode) and isinstance(details["input"], list | tuple | dict):
-        text = _in_one_line(node)
-        return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+        return shortened(_in_one_line(node))
     return shown(details["input"])
 
 
@@ -149,7 +148,8 @@ def _in_one_line(node: yaml.Node) -> str:
     if isinstance(node, yaml.SequenceNode):
         return f"[{', '.join(map(_in_one_line, node.value))}]"
     if isinstance(node, yaml.MappingNode):
-        return f"{{{', '.join(f'{_in_one_line(name)}: {_in_one_line(value)}' for name, value in node.value)}}}"
+        pairs = [f"{_in_one_line(name)}: {_in_one_line(value)}" for name, value in node.value]
+        return f"{{{', '.join(pairs)}}}"
     return str(node.value)
 
 

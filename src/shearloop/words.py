@@ -2,7 +2,7 @@
 
 import re
 
-LONGEST_VALUE = 60
+_LONGEST_VALUE = 60
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
@@ -25,8 +25,12 @@ def beyond(value: float, limit: float, decimals: int, sign: str = "") -> str:
 
 def shown(value: object) -> str:
     """Return a value of a file for a message, at most 60 characters."""
-    text = repr(value)
-    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 1]}…"
+    return shortened(repr(value))
+
+
+def shortened(text: str) -> str:
+    """Return a text for a message, at most 60 characters."""
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"
 
 
 def is_whole_number(text: str, most_digits: int) -> bool:

@@ -38,7 +38,7 @@ _KEY = r"(?P<before>\s*(?:- +)*\{?)(?P<key>[a-z]\w*)"
 
 
 class _Cure(NamedTuple):
-    """A change of one line that may end a syntax error, and the words for what is wrong in this line."""
+    """A change of one line that may cure a syntax error, and the cause in words."""
 
     wrong: re.Pattern[str]
     right: str
@@ -97,7 +97,7 @@ def _explained(error: yaml.YAMLError, text: str) -> tuple[str, str]:
 
 
 def _no_character(error: yaml.YAMLError, text: str) -> tuple[str, str]:
-    """Return the place and the words for a character that no text has."""
+    """Return the place and the words for a character that no text may have."""
     if not isinstance(error, yaml.reader.ReaderError):
         return "", " ".join(str(error).split())
     if is_utf_16(text.encode()):
@@ -112,13 +112,13 @@ def _place(text: str, index: int) -> str:
 
 
 def _lookalike(text: str, index: int) -> tuple[str, str]:
-    """Return the place and the words for the first character from an index on that looks like another one."""
+    """Return the place and the words for the first lookalike from an index on."""
     index += first_lookalike(text[index:]) or 0
     return _place(text, index), describe(text[index])
 
 
 def _cured(lines: Sequence[str], error: yaml.MarkedYAMLError, mark: yaml.Mark) -> tuple[str, str] | None:
-    """Return the place and the words of what is wrong in a line, if the error is gone without it."""
+    """Return the place and the cause of an error that a trial cures, None if no trial does."""
     if mark.index > _LONGEST_TRIED or not isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
         return None
     numbers = [*range(mark.line, max(mark.line - _LINES_TRIED, -1), -1)]
@@ -135,7 +135,7 @@ def _cured(lines: Sequence[str], error: yaml.MarkedYAMLError, mark: yaml.Mark) -
 
 
 def _cures_of(line: str) -> Iterator[tuple[int, str, str]]:
-    """Yield other spellings of a line: the column where it differs, the line, and the words for what was wrong."""
+    """Yield other spellings of a line: the column where it differs, the line, and the cause in words."""
     if (column := first_lookalike(line)) is not None:
         yield column, without_lookalikes(line), describe(line[column])
     for cure in _CURES:
@@ -152,7 +152,9 @@ def _moved(lines: Sequence[str], number: int) -> Iterator[tuple[int, str, str]]:
         entry = re.match(r"( *- +)\{?(\w*)", above)
         if entry is not None and begins is not None and entry[2] == begins[1]:
             yield blank, entry[1] + text, "a `-` is missing before this entry"
-        indents = [len(above) - len(above.lstrip(" ")), *([len(entry[1])] if entry is not None else [])]
+        indents = [len(above) - len(above.lstrip(" "))]
+        if entry is not None:
+            indents.append(len(entry[1]))
         for other in indents:
             words = f"this line is indented by {counted(blank, 'space')}, and a line above by {other}"
             yield blank, " " * other + text, words

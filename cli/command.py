@@ -231,7 +231,7 @@ def _lines(name: str, reply: Mapping[str, Any]) -> list[str]:
     if name == "tare":
         end = "`shearloop command status` shows its end, and `start` is refused until then"
         lost = reply.get("not_connected", ())
-        are = "are" if lost[1:] else "is"
+        are = "are" if len(lost) > 1 else "is"
         without = f"; NOT of {', '.join(lost)}, which {are} not connected" if lost else ""
         return [f"tare: the zero of {', '.join(reply['taring'])} is being taken{without}; {end}"]
     if name == "stop":

@@ -226,8 +226,7 @@ def find_clock_fault(series: FrameSeries, found: LoadDelay | None) -> ClockFault
             best, most = fault, explained
     if best is None:
         return None
-    timed = replace(series, torque_t_s=best.torque_t_s)
-    delay = _delay_of(timed, segment_grip(timed)[1])
+    delay = measured_delay([replace(series, torque_t_s=best.torque_t_s)])
     return best if delay is not None and delay.error_s <= _LARGE_ERROR_S else None
 
 

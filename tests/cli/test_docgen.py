@@ -103,6 +103,15 @@ async def next_line(printed: asyncio.StreamReader, part: bytes) -> bytes:
     return line
 
 
+async def subscribed(publisher: Publisher, printed: asyncio.StreamReader, line: bytes) -> None:
+    """Publish an estimate of 0.25 N·m until the program has subscribed and prints it as this line."""
+    seen = asyncio.create_task(next_line(printed, line))
+    while not seen.done():
+        publisher.publish(sample(EitEstimate, source="left", torque_nm=0.25))
+        await asyncio.wait([seen], timeout=0.05)
+    await seen
+
+
 def program_of(ending: str, folder: Path) -> list[object]:
     """Return the command that runs an example program, with the socket in this folder as the daemon's address."""
     program = (DOCS / f"examples/subscriber.{ending}").read_text()
@@ -125,11 +134,7 @@ async def test_a_subscriber_prints_whose_estimate_it_is_and_why_there_is_none(en
         publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
         try:
             async with printing(*command) as printed:
-                seen = asyncio.create_task(next_line(printed, b" left 0.25 N\xc2\xb7m\n"))
-                while not seen.done():
-                    # Until it has subscribed.
-                    publisher.publish(sample(EitEstimate, source="left", torque_nm=0.25))
-                    await asyncio.wait([seen], timeout=0.05)
+                await subscribed(publisher, printed, b" left 0.25 N\xc2\xb7m\n")
                 publisher.publish(
                     sample(EitEstimate, source="right", torque_nm=None, valid=False, reason="the grip is weak")
                 )
@@ -155,12 +160,7 @@ async def test_the_subscriber_with_keys_hears_a_daemon_on_the_network(config, ke
         script.write_text(program.replace("tcp://lab-pc:7761", address))
         monkeypatch.setenv("HOME", str(tmp_path / "home"))
         async with printing(sys.executable, script) as printed:
-            seen = asyncio.create_task(next_line(printed, b" left 0.25\n"))
-            while not seen.done():
-                # Until it has subscribed.
-                daemon.publisher.publish(sample(EitEstimate, source="left", torque_nm=0.25))
-                await asyncio.wait([seen], timeout=0.05)
-            await seen
+            await subscribed(daemon.publisher, printed, b" left 0.25\n")
 
 
 def test_the_key_file_on_the_page_has_the_format_that_keys_writes(keys, written, tmp_path):
